@@ -130,15 +130,24 @@ def test_everything_exported_is_there():
         orthocal.nonsense  # noqa: B018
 
 
-def test_help_imports_nothing_heavy():
+HEAVY = {
+    "--help": "numpy casadi pinocchio scipy yourdfpy pydantic meshcat matplotlib tornado coal",
+    "calibrate examples/table1/experiment-2": "meshcat matplotlib tornado joblib pyarrow "
+    "orthocal.planning orthocal.printers.firmwares orthocal.io.tables.workbook",
+}
+"""Modules that a command must not import."""
+
+
+@pytest.mark.parametrize("command", HEAVY)
+def test_a_command_imports_nothing_heavy(command):
     code = (
-        "import sys; sys.argv = ['orthocal', '--help']\n"
+        f"import sys; sys.argv = {['orthocal', *command.split()]}\n"
         "from orthocal.cli import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        "heavy = {'numpy', 'casadi', 'pinocchio', 'scipy', 'yourdfpy', 'pydantic', 'meshcat', "
-        "'matplotlib', 'tornado', 'coal'}\n"
-        "print('LOADED', sorted(heavy & set(sys.modules)))\n"
+        f"print('LOADED', sorted({set(HEAVY[command].split())} & set(sys.modules)))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert "LOADED []" in done.stdout
