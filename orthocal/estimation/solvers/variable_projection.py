@@ -67,9 +67,9 @@ class VariableProjection(Program):
     def _solve(self, data: SolverInput) -> Solution:
         """Best optimum from the start values and, if there are mirror images, from these."""
         best = self._solve_from_start(data)
-        if not (data.mirrored and len(self.problem.mirrored)):
-            return best
         directions = self.problem.mirrored.of_task(data.sigma, data.prescribed)
+        if not (data.mirrored and len(directions)):
+            return best
         iterations, passive = best.iterations, best.passive
         starts = self.problem.mirrored_starts(best.theta[None], passive[None], directions)
         for start in starts[:, 0]:
