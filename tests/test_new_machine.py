@@ -481,6 +481,19 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
 
 
+def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path):
+    """The workspace of a linear delta depends on its radius; short slides do not reach it."""
+    short = [w.replace("30:560", "200:300") for w in DELTA]
+    code, _, err = orthocal("new", tmp_path / "delta", *short)
+    assert code == 2
+    assert err.startswith("orthocal: --workspace-mm: by default the machine does not reach")
+    assert "'c_slide' would be at" in err
+    assert "the largest box of this shape is x ±40, y ±40, z 0…11.43 mm" in err
+    assert "yaml" not in err
+    box = "--workspace-mm=-40:40,-40:40,0:11"
+    assert orthocal("new", tmp_path / "delta", *short, box).returncode == 0
+
+
 def test_stated_sensors_are_planned(tmp_path, monkeypatch, quick_plans, without_sensor_gains):
     monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:2])
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"

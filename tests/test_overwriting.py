@@ -102,3 +102,51 @@ def test_measured_readings_are_never_replaced(folder):
             assert done.returncode == 2, words
             assert ("does not overwrite" if force else "exists already") in done.stderr
             assert {p.name: p.read_bytes() for p in (folder / "session").iterdir()} == before
+
+
+INVALID = {
+    "a robot that is not there": lambda text: text.replace("robot: orthoglide", "robot: gone"),
+    "a key that does not exist": lambda text: text + "colour: blue\n",
+    "no YAML": lambda text: text + "] [\n",
+    "no session.yaml": None,
+    "a plan without the table": lambda text: text.replace("readings: readings.csv\n", ""),
+}
+
+
+@pytest.mark.parametrize("invalid", INVALID)
+@pytest.mark.parametrize(
+    ("table", "count"),
+    [
+        (None, "6 readings"),
+        ("setup;posture;cycle;reading_mm\nyx;zero;1;-0,02\nyx;x_max;1;\n", "1 reading,"),
+        ("setup,posture,x_mm,y_mm,z_mm\ntrack,a,1.5,2,3\n", "1 reading,"),
+        ("Aufbau\tStellung\tMesswert\nyx\tzero\t0,5\nyx\tx_max\t.3\n", "2 readings"),
+    ],
+    ids=["as measured", "semicolons", "points", "other headings"],
+)
+def test_readings_of_a_session_that_does_not_load_are_not_replaced(folder, invalid, table, count):
+    change, session = INVALID[invalid], folder / "session/session.yaml"
+    if change is None:
+        session.unlink()
+    else:
+        session.write_text(change(session.read_text()))
+    readings = folder / "session/readings.csv"
+    if table is not None:
+        readings.write_text(table)
+    before = readings.read_bytes()
+    words = ("again", "one", "--out", "session", "--force")
+    done = run_orthocal(folder, *words)
+    assert done.returncode == 2
+    assert f"session/readings.csv: contains {count}" in done.stderr
+    assert "--force does not overwrite" in done.stderr
+    assert readings.read_bytes() == before
+
+
+@pytest.mark.parametrize("table", [None, "setup,posture,cycle,reading_mm\nyx,zero,1,\n", ""])
+def test_a_plan_that_does_not_load_is_replaced(folder, table):
+    session, readings = folder / "session/session.yaml", folder / "session/readings.csv"
+    session.write_text(session.read_text() + "colour: blue\n")
+    readings.unlink()
+    if table is not None:
+        readings.write_text(table)
+    assert run_orthocal(folder, "again", "one", "--out", "session", "--force").returncode == 0

@@ -320,6 +320,15 @@ def test_a_reading_that_shows_another_offset_is_no_contradiction(root, run, tmp_
     assert "differs by" not in out
 
 
+def test_a_warning_names_all_of_its_lines(root, run, tmp_path):
+    """30 of 54 readings have more digits than the dial shows."""
+    session = load_session(root / "examples/raw-cycles")
+    fine = session.values + 3e-7 * (np.arange(len(session.readings)) < 30)
+    write_session(session.with_values(fine), tmp_path / "fine")
+    text = run(tmp_path / "fine").stdout
+    assert "Finer than the gauge (lines 2 to 31): 30 of 54" in text
+
+
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):
     folder = tmp_path / "typed"
     values = blank(root / "examples/raw-cycles", folder)

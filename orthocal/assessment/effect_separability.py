@@ -26,7 +26,7 @@ from orthocal.effects.loading import (
     neutral_values,
 )
 from orthocal.hypotheses.linear_model import linear_model
-from orthocal.observation.observations import drive_table
+from orthocal.observation.observations import drive_table, readings_without
 from orthocal.session.session import Conditions, Session
 
 MAX_R_SQUARED = 0.95
@@ -60,6 +60,10 @@ def _unshown_backlash(session: Session) -> Iterator[Finding]:
     if not approaches:
         yield words.approach_not_stated()
         return
+    missing = readings_without(session, "approach")
+    if missing:
+        lines = sorted({r.line for r in missing if r.line is not None})
+        yield words.approach_incomplete(lines, len(missing), len(session.readings))
     names = list(session.postures)
     rows_read = sorted({names.index(r.posture) for r in session.readings})
     distance = np.abs(drive_table(session)[rows_read] - session.robot.drive_zero)

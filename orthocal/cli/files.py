@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import orthocal
@@ -69,6 +70,45 @@ def load_joined(
     """Load sessions and join them into one; for arguments and errors see `load_each_once`."""
     return orthocal.join_sessions(
         load_each_once(paths, effects=effects, tolerance=tolerance, partial=partial)
+    )
+
+
+def require_not_calibrated(
+    sessions: Sequence[orthocal.Session], calibration: orthocal.Calibration
+) -> None:
+    """Refuse copies of the sessions of a calibration, which would confirm it.
+
+    Raises:
+        SessionError: If a session is a copy; names both sessions and the lines that differ.
+    """
+    from orthocal.calibration.refit import restore_session
+    from orthocal.measurement.joining import split_sessions
+
+    record_of_all, parts = calibration.session, split_sessions(restore_session(calibration))
+    records = record_of_all.parts
+    if len(records) != len(parts):  # one session, or joined ones whose files are unknown
+        records = (record_of_all,) * len(parts)
+    for record, part in zip(records, parts, strict=True):
+        other = replace(
+            part,
+            path=None if record.path is None else Path(record.path),
+            readings=tuple(_without_label(r, joined=part.joined) for r in part.readings),
+        )
+        for session in sessions:
+            if not session.was_read_from(record.sha256):  # `validate_calibration` refuses it
+                _require_measured_again(session, other)
+
+
+def _without_label(reading: orthocal.Reading, *, joined: bool) -> orthocal.Reading:
+    """Reading of a session that may be joined, with the names of its own session."""
+    from orthocal.session.session import split_label
+
+    minus = reading.minus
+    return replace(
+        reading,
+        setup=split_label(reading.setup, joined=joined)[1],
+        posture=split_label(reading.posture, joined=joined)[1],
+        minus=None if minus is None else split_label(minus, joined=joined)[1],
     )
 
 

@@ -259,8 +259,7 @@ def _design(
     machine, counting, asked = find_answers(kind, dimensions.by_key())
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
         robot = _make_trial(machine, Path(trial) / name, counting, effects)
-        if asked or options.workspace_mm is not None:
-            robot = _with_workspace(robot, options.workspace_mm)
+        robot = _with_workspace(robot, options.workspace_mm, asked=asked)
         if asked and tolerance is None:
             tolerance = ask_tolerance(USUAL_OFFSET)
         if robot.workspace is not None:
@@ -356,18 +355,26 @@ def _require_new(folder: Path, *, force: bool) -> str:
     return name
 
 
-def _with_workspace(robot: orthocal.Robot, option: str | None) -> orthocal.Robot:
-    """Robot with the workspace of the option or of an answer.
+def _with_workspace(robot: orthocal.Robot, option: str | None, *, asked: bool) -> orthocal.Robot:
+    """Robot with the workspace of the option, of an answer, or of its kind.
 
     Raises:
         ParameterError: If the machine does not reach the workspace.
     """
     from orthocal.cli.dialogue import ask_workspace
-    from orthocal.kinematics.reachable_box import find_workspace
+    from orthocal.kinematics.reachable_box import describe_unreachable_box, find_workspace
     from orthocal.kinematics.workspace import describe_box
 
     if option is not None:
         return replace(robot, workspace=read_workspace(option, robot))
+    box = robot.workspace
+    problem = "" if box is None else describe_unreachable_box(robot, box)
+    if problem:
+        raise ParameterError(
+            f"by default {problem}; state a workspace, or other dimensions", where="--workspace-mm"
+        )
+    if not asked:
+        return robot
     usual = describe_box(find_workspace(robot).limits)
     box = ask_workspace(usual, lambda text: read_workspace(text, robot))
     return robot if box is None else replace(robot, workspace=box)

@@ -1,7 +1,8 @@
 """Rule for existing files that commands may overwrite.
 
 Results that orthocal wrote are replaced. With --force only, other files are overwritten, and those
-of a machine or a session, which users edit and fill in. Measured readings are never overwritten.
+of a machine or a session, which users edit and fill in. Measured readings are never overwritten,
+even if their session cannot be loaded.
 """
 
 from __future__ import annotations
@@ -37,6 +38,15 @@ _MARKS = re.compile(
 )
 """Marks of the files that orthocal writes."""
 
+READINGS = "readings.csv"
+"""Table of readings that commands write beside a session.yaml."""
+
+_READING_COLUMNS = ("reading", "x_mm", "y_mm", "z_mm")
+"""Beginnings of the headings of readings and measured points."""
+
+_NUMBER = re.compile(r'[\s"\']*[-+\u2212]?[.,]?\d')
+"""Beginning of a number in a cell."""
+
 _SEARCHED_BYTES = 4096
 """Number of bytes at the beginning and at the end of a file in which its mark is searched."""
 
@@ -71,23 +81,50 @@ def _require_no_readings(directory: Path) -> None:
     """Refuse to overwrite measured readings.
 
     Raises:
-        SessionError: If the session of the directory has readings that were not simulated.
+        SessionError: If the session of the directory has readings that were not simulated. Where it
+            cannot be loaded, all readings count as measured.
     """
-    from orthocal.measurement.files.session_file import SESSION, load_rows
+    from orthocal.assessment.wording import counted
+    from orthocal.measurement.files.session_file import load_rows
 
-    if not exists(directory / SESSION):
-        return
     out_of_range: list[SessionError] = []
+    table = directory / READINGS
     try:
         session = load_rows(directory, wrong=out_of_range)
     except OrthocalError:  # not a valid session
-        return
-    count = sum(r.is_read for r in session.readings) + len(out_of_range)
-    if count and not session.source.startswith(SIMULATED):
+        count, path = 0, None
+    else:
+        count = sum(r.is_read for r in session.readings) + len(out_of_range)
+        count = 0 if session.source.startswith(SIMULATED) else count
+        path = session.readings_path
+    named = path is not None and exists(table) and path.samefile(table)
+    if not count and not named:  # a table that no valid session names
+        count, path = _count_numbers(table), table
+    if count:
         raise SessionError(
-            f"contains {count} readings, which --force does not overwrite; move them first",
-            where=str(session.readings_path or directory),
+            f"contains {counted(count, 'reading')}, which --force does not overwrite; move "
+            f"{'it' if count == 1 else 'them'} first",
+            where=str(path),
         )
+
+
+def _count_numbers(path: Path) -> int:
+    """Number of rows with a number among the readings of a table, whatever else is wrong in it.
+
+    Without a column of readings, any number except that of a cycle counts.
+    """
+    try:
+        text = path.read_bytes().decode(errors="replace")
+    except OSError:
+        return 0
+    header, *lines = text.splitlines() or [""]
+    separator = max(",;\t", key=header.count)
+    names = [name.strip(' "\ufeff').casefold() for name in header.split(separator)]
+    columns = [i for i, name in enumerate(names) if name.startswith(_READING_COLUMNS)]
+    if not columns:
+        columns = [i for i, name in enumerate(names) if name != "cycle"]
+    rows = (line.split(separator) for line in lines)
+    return sum(any(_NUMBER.match(c) for i, c in enumerate(row) if i in columns) for row in rows)
 
 
 def require_replaceable_results(directory: Path, files: Mapping[str, str], *, force: bool) -> None:

@@ -32,19 +32,33 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     """
     from orthocal.assessment.wording import counted
     from orthocal.measurement.files.session_file import load_rows
-    from orthocal.measurement.importing.traces import read_trace, with_traces
+    from orthocal.measurement.importing.traces import (
+        FEWEST_SAMPLES,
+        bin_traces,
+        read_trace,
+        with_traces,
+    )
 
     require_new_session(out, FILES, force=force)
     plan = load_rows(session)
     files = _split(traces)
     by_setup = {name: read_trace(path, plan.robot) for name, path in files.items()}
-    averaged = with_traces(plan, by_setup)
+    binned = bin_traces(plan, by_setup)
+    averaged = with_traces(plan, binned)
     path = orthocal.write_session(averaged, out)
     samples = sum(len(t.values) for t in by_setup.values())
     put_note(
         f"Wrote {path}: {counted(len(averaged.readings), 'reading')}, of which the traces of "
         f"{', '.join(by_setup)} are {samples} samples"
     )
+    unused = sum(t.unused_bins for t in binned.values())
+    if unused:
+        in_bins = sum(t.unused_samples for t in binned.values())
+        put_note(
+            f"{unused} of {counted(unused + sum(len(t.values) for t in binned.values()), 'bin')} "
+            f"({counted(in_bins, 'sample')}) {'was' if unused == 1 else 'were'} not used: a bin "
+            f"needs {FEWEST_SAMPLES} samples at different positions"
+        )
 
 
 def _split(traces: list[str]) -> dict[str, Path]:

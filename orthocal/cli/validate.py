@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.files import load_each_once
+from orthocal.cli.files import load_each_once, require_not_calibrated
 from orthocal.cli.options import (
     AllRows,
     CalibrationPath,
@@ -37,6 +37,7 @@ def validate(
     """
     before = orthocal.load_calibration(calibration)
     loaded = load_each_once(sessions, tolerance=tolerance)
+    require_not_calibrated(loaded, before)
     tolerances = read_tolerances(tolerance, before.robot)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json, details=details):
         validation = orthocal.validate_calibration(before, loaded, tolerances=tolerances)

@@ -262,7 +262,7 @@ def _solve_with_noise(
     problem = program.problem
     repeatability = estimate_repeatability(problem.values, problem.observations)
     solution, sigma = _solve_first(program, linear, repeatability, start)
-    iterations = solution.iterations
+    iterations, compared = solution.iterations, True
     for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
         evaluation = _evaluate(program, solution, sigma, repeatability)
         estimated = floored_sigma(evaluation.noise)
@@ -270,15 +270,22 @@ def _solve_with_noise(
         ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
         sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
         converged = ratio_agrees and sigma_agrees
-        if converged or not remaining:
+        if (converged and compared) or not remaining:
             break
-        if not sigma_agrees:  # sigma first, because the ratios depend on it
+        if converged:  # the better sides of mirrored directions may depend on sigma
+            pass
+        elif not sigma_agrees:  # sigma first, because the ratios depend on it
             sigma = estimated
         else:
             problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
-        start_theta, start_passive = solution.theta, solution.passive
-        solution = program.solve(sigma=sigma, start=start_theta, start_passive=start_passive)
+        compared = converged or not len(problem.mirrored)
+        solution = program.solve(
+            sigma=sigma,
+            start=solution.theta,
+            start_passive=solution.passive,
+            mirrored=compared,
+        )
         iterations += solution.iterations
     return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
 

@@ -10,7 +10,7 @@ parameters of the sensors. Known gauge zeros z are 0.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Literal
 
@@ -19,6 +19,11 @@ from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, RobotError
+from orthocal.estimation.mirrored_starts import (
+    MirroredDirections,
+    find_mirrored_directions,
+    mirrored_starts,
+)
 from orthocal.estimation.selection import KnownWithStd, Selection, select_parameters
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.kinematics.continuation import Failures
@@ -326,6 +331,38 @@ class CalibrationProblem:
             self.elementary_errors(theta), q, self._nuisance_deviations(theta)
         )
         return np.asarray(readings / self.noise_ratio)
+
+    @cached_property
+    def mirrored(self) -> MirroredDirections:
+        """Directions of nuisance parameters that may have local optima on both sides."""
+        vectors = [self.n_machine + np.array(v) for v in self.model.nuisance.mirrored]
+        if not vectors:
+            return MirroredDirections(np.zeros((0, self.n_free)), np.zeros(0))
+        start = (self.active_theta / self.theta_scale)[None]
+        predict = self._predict_near(start, self.active_passive[None])
+        return find_mirrored_directions(predict, vectors, self.n_free)
+
+    def mirrored_starts(self, theta: Array, passive: Array, directions: Array) -> Array:
+        """Start values of other local optima, shape (n_starts, S, n_free), [SI].
+
+        Args:
+            theta: Solutions of S sets of readings, shape (S, n_free), [SI].
+            passive: Their passive coordinates, shape (S, n_states, n_passive), [m, rad].
+            directions: Mirrored directions along which a start may change, shape (n, n_free).
+        """
+        scaled = theta / self.theta_scale
+        predict = self._predict_near(scaled, passive)
+        return mirrored_starts(predict, scaled, directions) * self.theta_scale
+
+    def _predict_near(self, theta: Array, passive: Array) -> Callable[[Array], Array]:
+        """Function from changes of the nuisance parameters in θ̂ to readings (see `Predict`)."""
+
+        def predict(changes: Array) -> Array:
+            n_sets, n = len(theta), len(changes)
+            changed = (theta[:, None] + changes).reshape(n_sets * n, -1) * self.theta_scale
+            return self.predict(changed, passive.repeat(n, axis=0)).reshape(n_sets, n, -1)
+
+        return predict
 
     def predict_and_jacobian(
         self,

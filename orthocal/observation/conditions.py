@@ -24,14 +24,19 @@ MINUTES_PER_READING = 0.5
 MORNING = datetime(2025, 1, 6, 9, 0)
 """Time of the first reading of a day without a date."""
 
-STATED: tuple[Condition, ...] = ("approach", "temperature", "time")
-"""Conditions that a reading may state; others belong to the machine or to the session."""
+COLUMNS_OF_CONDITIONS: dict[Condition, str] = {
+    "approach": "approach",
+    "temperature": "temperature_C",
+    "time": "time",
+}
+"""Columns of a readings.csv that state conditions of readings. Other conditions belong to the
+machine or to the session."""
 
 
 def needed_conditions(robot: Robot) -> tuple[Condition, ...]:
     """Conditions of a reading on which effects of a robot depend, in the order of their columns."""
     needed = {c for effect in robot_effects(robot) for c in effect.conditions}
-    return tuple(c for c in STATED if c in needed)
+    return tuple(c for c in COLUMNS_OF_CONDITIONS if c in needed)
 
 
 def schedule_readings(

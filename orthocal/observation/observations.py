@@ -17,8 +17,10 @@ from orthocal.errors import SessionError
 from orthocal.kinematics.conditions import APPROACH, UseConditions
 from orthocal.kinematics.error_map import error_map
 from orthocal.kinematics.loop_closure import LoopClosure, find_loads
+from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
+from orthocal.text import spans
 
 READING_INTERVAL = 60.0
 """Assumed time between successive readings of a setup without times, [s]."""
@@ -425,7 +427,7 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
         free: Names of the free parameters of the machine.
 
     Raises:
-        SessionError: If a condition is missing; names the first such reading.
+        SessionError: If a condition is missing; names its column and the lines without it.
     """
     parameters = session.robot.parameters
     errors = {term for name in free for term, _ in parameters[name].terms}
@@ -437,13 +439,27 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
             missing, total = readings_without(session, condition), len(session.readings)
             if not missing or (len(missing) == total and not explicit):
                 continue
-            first = missing[0]
-            problem = "is a difference" if first.minus else f"is a reading without {condition}"
+            problem = _missing_condition(session, condition, missing)
             raise SessionError(
-                f"{problem}; the effect '{effect.name}' needs the {condition} of each reading, "
+                f"{problem}. The effect '{effect.name}' needs the {condition} of each reading, "
                 f"which {len(missing)} of {total} readings do not state",
-                where=session.where(first),
+                where=session.where(missing[0]),
             )
+
+
+def _missing_condition(session: Session, condition: Condition, missing: Sequence[Reading]) -> str:
+    """Readings without a condition, with their lines, and what to fill in."""
+    if missing[0].minus:
+        return "is a difference"
+    first = missing[0].file or session.readings_path
+    lines = [r.line for r in missing if (r.file or session.readings_path) == first]
+    numbers = sorted({line for line in lines if line is not None})
+    where = f" in {spans(numbers, 'line')}" if numbers else ""
+    column = COLUMNS_OF_CONDITIONS.get(condition)
+    if column is None:
+        return f"{condition} is missing{where}"
+    empty = "missing or empty" if len(missing) == len(session.readings) else "incomplete"
+    return f"the column `{column}` is {empty}{where}"
 
 
 def readings_without(session: Session, condition: Condition) -> list[Reading]:

@@ -11,7 +11,7 @@ from orthocal.effects.loading import reading_effects
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
-from orthocal.sensors.protocol import NuisanceParameter
+from orthocal.sensors.protocol import NuisanceParameter, mirrored_parameters
 from orthocal.session.session import Session, Setup, split_label
 
 OF_GAUGE = "gauge."
@@ -44,12 +44,15 @@ class NuisanceParameters:
     """Parameters, named after their setup or after the object that several setups share."""
     of_setup: tuple[tuple[int, ...], ...]
     """Indices of the parameters of each setup, those of the sensor first."""
+    mirrored: tuple[tuple[int, ...], ...]
+    """Indices of the parameters of each vector that readings may determine only up to a sign."""
 
 
 def nuisance_parameters(session: Session) -> NuisanceParameters:
     """Nuisance parameters of all setups with readings."""
     parameters: dict[str, Parameter] = {}
     of_setup: list[tuple[int, ...]] = []
+    mirrored: dict[tuple[str, ...], None] = {}
     read = {r.setup for r in session.readings}
     for setup in session.setups.values():
         if setup.name not in read:
@@ -67,7 +70,14 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
         for parameter in setup_parameters:
             parameters.setdefault(parameter.name, parameter)
         of_setup.append(tuple(list(parameters).index(p.name) for p in setup_parameters))
-    return NuisanceParameters(tuple(parameters.values()), tuple(of_setup))
+        vector = mirrored_parameters(setup.sensor)
+        if vector:
+            mirrored[tuple(f"{_owner(p, setup, session)}.{p.name}" for p in vector)] = None
+    return NuisanceParameters(
+        tuple(parameters.values()),
+        tuple(of_setup),
+        tuple(tuple(list(parameters).index(name) for name in vector) for vector in mirrored),
+    )
 
 
 def nominal_values(session: Session) -> dict[str, float]:

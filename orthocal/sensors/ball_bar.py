@@ -99,6 +99,7 @@ class BallBar(ToolSensor):
     keys: ClassVar[type[SetupKeys]] = BallBarKeys
     ideal: ClassVar[str] = "its sphere"
     zero: ClassVar[GaugeZero] = "known"
+    mirrored: ClassVar[tuple[str, ...]] = ("centre_x", "centre_y", "centre_z")
 
     @classmethod
     def from_keys(cls, keys: BallBarKeys) -> BallBar:

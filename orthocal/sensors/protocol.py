@@ -177,6 +177,11 @@ class Sensor(Protocol):
     # largest_reading: ClassVar[float], optional: largest reading, [m]; 300 mm by default
     # (`largest_reading`)
 
+    # mirrored: ClassVar[tuple[str, ...]], optional: nuisance parameters that form a vector, such as
+    # the position of a fixed ball, and that some postures determine only up to a sign. Solvers
+    # start from both sides of a direction that changes readings only to second order
+    # (`mirrored_parameters`)
+
     # dimensions: Mapping[str, Sensor], optional: sensors with one dimension that is larger by
     # DIMENSION_STEP, by the key of this dimension in a session.yaml (`stated_dimensions`)
 
@@ -297,6 +302,12 @@ def stated_dimensions(sensor: Sensor) -> Mapping[str, Sensor]:
     """Sensors with one dimension larger by DIMENSION_STEP, by the key of the dimension."""
     dimensions: Mapping[str, Sensor] = getattr(sensor, "dimensions", {})
     return dimensions
+
+
+def mirrored_parameters(sensor: Sensor) -> tuple[NuisanceParameter, ...]:
+    """Nuisance parameters of a vector that readings may determine only up to a sign."""
+    names: tuple[str, ...] = getattr(sensor, "mirrored", ())
+    return tuple(p for p in sensor.nuisance_parameters if p.name in names) if names else ()
 
 
 def default_zero(sensor: Sensor) -> GaugeZero:

@@ -67,6 +67,16 @@ def test_readings_without_conditions_show_no_effect(plan):
     assert kinds[:2] == ["effect not shown"] * 2
 
 
+def test_readings_without_approach_are_counted_with_their_lines(plan):
+    rows = [replace(r, line=i + 2) for i, r in enumerate(plan.readings)]
+    for i in (3, 4, 5, 9):
+        rows[i] = replace(rows[i], conditions=replace(rows[i].conditions, approach=None))
+    (found, *_) = find(replace(plan, readings=tuple(rows)), ["backlash"])
+    assert found.numbers == {"missing": 4.0}
+    assert f"4 of {len(rows)} readings (lines 5 to 7, 11) do not state" in found.text
+    assert "`approach`" in found.action
+
+
 @pytest.mark.parametrize(("sigma", "helps"), [(20e-6, False), (1e-6, True)])
 def test_another_temperature_is_recommended_only_where_it_determines_more(plan, sigma, helps):
     """By the posterior limit of the coefficients relative to their tolerance, as in a plan."""

@@ -33,7 +33,7 @@ from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.measurement.files.session_file import load_rows
-from orthocal.measurement.importing.traces import Trace, with_traces
+from orthocal.measurement.importing.traces import Trace, bin_traces, with_traces
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment
@@ -567,9 +567,9 @@ def test_bins_of_a_trace_are_calibrated_faster_than_its_samples(tmp_path, record
         values = problem.observations.values(session.values)
         return VariableProjection(problem).solve(sigma=session.gauge.sigma, values=values)
 
-    assert len(with_traces(plan, many).readings) < 700
+    assert len(with_traces(plan, bin_traces(plan, many)).readings) < 700
     binned, each = fastest_each(
-        [lambda: solve(with_traces(plan, many)), lambda: solve(few)], rounds=2
+        [lambda: solve(with_traces(plan, bin_traces(plan, many))), lambda: solve(few)], rounds=2
     )
     record("binned_s", binned)
     record("binned", each / binned)

@@ -425,6 +425,12 @@ def test_readings_without_the_condition_are_refused(tmp_path):
     session = simulate_session(load_plan(folder), {"x_slide.offset": 1e-4}, seed=1).session
     with pytest.raises(SessionError, match="needs the approach"):
         identify(session, Choice(free=FREE, effects=["slack"]))
+    numbered = tuple(replace(r, line=i + 2) for i, r in enumerate(session.readings))
+    last, n = f"lines 2 to {len(numbered) + 1}", len(numbered)
+    with pytest.raises(SessionError) as caught:
+        identify(replace(session, readings=numbered), Choice(free=FREE, effects=["slack"]))
+    assert f"column `approach` is missing or empty in {last}. The effect" in str(caught.value)
+    assert f"{n} of {n} readings" in str(caught.value)
     # errors of an effect that only the robot has keep their tolerances
     kept = identify(session, Choice(free=FREE), **QUICK)[0]["x_slide.slack"]
     assert (kept.value, kept.std) == pytest.approx((0.0, 40e-6), rel=1e-6)

@@ -14,7 +14,13 @@ from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.measurement.files.session_file import load_rows
-from orthocal.measurement.importing.traces import Trace, bin_trace, read_trace, with_traces
+from orthocal.measurement.importing.traces import (
+    Trace,
+    bin_trace,
+    bin_traces,
+    read_trace,
+    with_traces,
+)
 from orthocal.session.session import Conditions, Posture, Reading
 
 RADIUS, SIGMA = 50e-3, 2e-6
@@ -90,7 +96,7 @@ def test_bins_give_the_answer_of_all_points(plan, machine):
         for k, (p, d, v) in enumerate(zip(points, closure.inverse(points), values, strict=True)):
             postures[f"{plane}{k}"] = Posture(f"{plane}{k}", "tcp", p, d)
             readings.append(Reading(plane, f"{plane}{k}", value=float(v)))
-    binned = with_traces(plan, traces)
+    binned = with_traces(plan, bin_traces(plan, traces))
     assert len(binned.readings) < 700
     pointwise = replace(plan, postures=postures, readings=tuple(readings))
     names, all_points, std = solve(pointwise, SIGMA)
@@ -103,7 +109,7 @@ def test_bins_give_the_answer_of_all_points(plan, machine):
 def test_a_reversal_ends_a_bin_and_changes_the_approach(plan, machine):
     _, read = machine
     points = circle("xy", 4000, turns=0.3)
-    session = with_traces(plan, {"xy": Trace(points, read(points, 0))})
+    session = with_traces(plan, bin_traces(plan, {"xy": Trace(points, read(points, 0))}))
     approaches = [r.approach for r in session.readings]
     first, second = (approaches[: len(approaches) // 2], approaches[len(approaches) // 2 :])
     assert {a[0] for a in first} <= {"n", "u"}  # x falls from the right side up
@@ -136,7 +142,7 @@ def test_a_trace_comes_from_a_file_and_goes_into_a_session(plan, machine, tmp_pa
     np.savetxt(tmp_path / "xy.csv", rows, delimiter=",", header=head, comments="", fmt="%.7f")
     trace = read_trace(tmp_path / "xy.csv", plan.robot)
     np.testing.assert_allclose(trace.points, points, atol=1e-10)
-    session = with_traces(plan, {"xy": trace})
+    session = with_traces(plan, bin_traces(plan, {"xy": trace}))
     write_session(session, tmp_path / "session")
     again = load_session(tmp_path / "session")
     np.testing.assert_allclose(again.values, session.values, atol=1e-9)
@@ -153,10 +159,37 @@ def test_the_command_writes_a_session(plan, machine, tmp_path):
     done = orthocal(*words)
     assert done.returncode == 0
     assert "3000 samples" in done.stderr
+    assert "not used" not in done.stderr
     assert orthocal(*words).returncode == 2  # it would overwrite
     assert orthocal(*words[:2], "xy.csv", *words[3:]).returncode == 2
     session = load_session(tmp_path / "s")
     assert {r.setup for r in session.readings} == {"xy"}
+
+
+def test_bins_with_few_samples_are_counted(plan, machine, tmp_path):
+    """Two stretches of the path have one sample in ten, as after a lost connection."""
+    _, read = machine
+    points = circle("xy", 3000)
+    sample = np.arange(3000)
+    lost = ((sample > 500) & (sample < 600)) | ((sample > 2000) & (sample < 2050))
+    points = points[~lost | (sample % 10 == 0)]
+    binned = bin_trace(Trace(points, read(points, 0)))
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    half = along[-1] / 2
+    edges = np.append(np.linspace(0.0, half, 80)[:-1], np.linspace(half, 2.0 * half, 80))
+    counts = np.histogram(along, edges)[0]
+    assert binned.unused_bins == (counts < 8).sum() == 6
+    assert binned.unused_samples == counts[counts < 8].sum()
+    assert len(binned.values) + binned.unused_bins == len(counts)
+    rows = np.column_stack([points, read(points, 0)]) * 1e3
+    head = "x_mm,y_mm,z_mm,reading_mm"
+    np.savetxt(tmp_path / "xy.csv", rows, delimiter=",", header=head, comments="", fmt="%.7f")
+    done = orthocal("trace", plan.path, f"xy={tmp_path / 'xy.csv'}", "--out", tmp_path / "s")
+    sentence = (
+        f"{binned.unused_bins} of {len(counts)} bins ({binned.unused_samples} samples) were not "
+        "used: a bin needs 8 samples at different positions"
+    )
+    assert sentence in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -177,9 +210,9 @@ def test_a_wrong_trace_is_refused(plan, tmp_path, text, problem, line):
 
 def test_a_trace_at_rest_is_refused(plan):
     with pytest.raises(SessionError, match="does not move"):
-        with_traces(plan, {"xy": Trace(np.zeros((100, 3)), np.zeros(100))})
+        with_traces(plan, bin_traces(plan, {"xy": Trace(np.zeros((100, 3)), np.zeros(100))}))
     with pytest.raises(SessionError, match="is not a setup"):
-        with_traces(plan, {"ab": Trace(circle("xy", 100), np.zeros(100))})
+        with_traces(plan, bin_traces(plan, {"ab": Trace(circle("xy", 100), np.zeros(100))}))
 
 
 @pytest.mark.parametrize("samples", [500, 1000])
@@ -187,5 +220,5 @@ def test_a_trace_with_few_samples_is_refused(plan, samples):
     """Most of its bins have fewer samples than a line and its noise need."""
     trace = Trace(circle("xy", samples), np.zeros(samples))
     with pytest.raises(SessionError, match=f"has {samples} samples on a path of") as caught:
-        with_traces(plan, {"xy": trace})
+        with_traces(plan, bin_traces(plan, {"xy": trace}))
     assert "expected at least 8" in str(caught.value)

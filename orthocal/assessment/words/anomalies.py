@@ -27,8 +27,8 @@ from orthocal.session.session import Session, split_label
 from orthocal.text import capitalised, printable, spans, uncapitalised
 from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM, Unit
 
-MAX_PLACES = 20
-"""Largest number of places in a finding."""
+MAX_PLACES = 1000
+"""Largest number of places in a finding, which limits the size of calibration.json."""
 
 LARGEST_ODDS = 1e6
 """Odds above which the number is not printed."""
@@ -647,7 +647,7 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
             repeat = (
                 "Measure again and correct the command DELTA_ANALYZE, then import the log again"
             )
-        lines = [r.line for r in rows if r.line is not None][:MAX_PLACES]
+        lines = [r.line for r in rows if r.line is not None]
         omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
         return f"{repeat}. Or {omitted}, and calibrate again."
     what = "it" if len(rows) == 1 else "these"

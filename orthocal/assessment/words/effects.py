@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from orthocal.assessment.wording import joined, note, parameter_places
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.protocol import Effect
+from orthocal.text import spans
 
 EFFECT_NOUNS = {
     "backlash": "backlash",
@@ -29,6 +30,24 @@ def approach_not_stated() -> Finding:
         "No reading states from which side its posture was approached: the backlash of the drives "
         "is not estimated, and their tolerance is assumed.",
         "State it in the column `approach`.",
+    )
+
+
+def approach_incomplete(lines: Sequence[int], count: int, total: int) -> Finding:
+    """Finding about some readings without stated side of approach.
+
+    Args:
+        lines: Their lines, ascending; empty if unknown.
+        count: Number of these readings.
+        total: Number of all readings.
+    """
+    where = f" ({spans(lines, 'line')})" if lines else ""
+    return note(
+        "effect not shown",
+        f"{count} of {total} readings{where} do not state from which side their posture was "
+        "approached. `calibrate` needs it for the backlash of the drives.",
+        "Complete the column `approach`.",
+        missing=float(count),
     )
 
 

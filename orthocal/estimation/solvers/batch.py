@@ -2,8 +2,9 @@
 
 The Gauss-Newton method runs on all sets at once, from the linearised solutions, with the Jacobian
 of each set. An active-set method keeps the steps within the bounds. Sets that do not converge, or
-that end far from their prior, are solved one by one by variable projection. Every set therefore has
-the same optimum as if it was solved alone.
+that end far from their prior, are solved one by one by variable projection, and so are all sets of
+a problem with mirrored directions. Every set therefore has the same optimum as if it was solved
+alone.
 """
 
 from __future__ import annotations
@@ -87,7 +88,9 @@ class BatchSolver:
         size = max(
             1, min(MAX_JACOBIAN_NUMBERS // numbers, MAX_BATCH_STATES // max(problem.n_states, 1))
         )
-        for first in range(0, n_sets, size):
+        if len(problem.mirrored.of_task(sigma, ())):  # their sides are compared one by one
+            solution.solved_alone[:] = True
+        for first in range(0, 0 if solution.solved_alone.all() else n_sets, size):
             part = slice(first, first + size)
             self._solve_part(shared, y[part], solution, part)
         program = VariableProjection(problem, options=self.options)

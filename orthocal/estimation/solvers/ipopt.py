@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arrays import Array
-from orthocal.errors import OrthocalError, SolverError
+from orthocal.errors import ClosureError, OrthocalError, SolverError
 from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
@@ -28,6 +28,7 @@ from orthocal.estimation.solvers.program import (
     advise,
     scaled_bounds,
 )
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.runtime.interrupts import noticed_interrupt
 
 SMALLEST_WEIGHTING_SIGMA = 5e-6
@@ -130,6 +131,8 @@ class NonlinearProgram(Program):
             KeyboardInterrupt: At Ctrl-C, which CasADi would ignore.
         """
         exact, robust = self.options.hessian == "exact", self.options.loss.robust
+        if data.mirrored and len(self.problem.mirrored):
+            data = self._with_best_start(data)
         try:
             return self._run(data)
         except SolverError:
@@ -150,6 +153,17 @@ class NonlinearProgram(Program):
                 raise
             return program._run(data)
         return solution
+
+    def _with_best_start(self, data: SolverInput) -> SolverInput:
+        """Data with the start values on the better side of each mirrored direction.
+
+        Variable projection compares the sides. If it fails, the start values remain.
+        """
+        try:
+            best = VariableProjection(self.problem, options=self.options)._solve(data)
+        except (ClosureError, SolverError):
+            return data
+        return replace(data, start=best.theta, start_passive=best.passive)
 
     def _run(self, data: SolverInput, width_factor: float = 1.0) -> Solution:
         """Run Ipopt once, with a multiple of the width of a robust loss."""

@@ -59,6 +59,8 @@ class SolverInput:
     """Start values of the passive coordinates, (n_states, n_passive), [m, rad]."""
     prescribed: Mapping[int, float]
     """Indices of free parameters, mapped to prescribed values, [SI]."""
+    mirrored: bool = True
+    """Start from mirror images of the solution, too."""
 
 
 class Program(ABC):
@@ -95,6 +97,7 @@ class Program(ABC):
         start_passive: Array | None = None,
         excluded: ArrayLike | None = None,
         prescribed: Mapping[int, float] | None = None,
+        mirrored: bool = True,
     ) -> Solution:
         """Solve for one set of readings.
 
@@ -108,6 +111,8 @@ class Program(ABC):
                 [m, rad].
             excluded: Indices of the entries to exclude.
             prescribed: Indices of free parameters, mapped to prescribed values, [SI].
+            mirrored: Start from mirror images of the solution, too, if the problem has mirrored
+                directions. False for start values on the better sides.
 
         Raises:
             SolverError: If the solver does not converge.
@@ -122,6 +127,7 @@ class Program(ABC):
                 start=np.array(problem.active_theta if start is None else start, dtype=np.float64),
                 start_passive=start_passive,
                 prescribed=prescribed or {},
+                mirrored=mirrored,
             )
         )
 

@@ -46,6 +46,12 @@ OVERSHOOT = 0.5
 MIN_SHARE = 0.1
 """Smallest part of a relaxed step."""
 
+MAX_MIRRORED_ITERATIONS = 30
+"""Largest number of iterations from a mirror image; those that need more rarely converge."""
+
+SAME_OBJECTIVE = 1e-9
+"""Relative difference of the objectives of one optimum from two starts."""
+
 OBJECTIVE_TOLERANCE = 1e-12
 """Relative growth of the objective that counts as a rounding error."""
 
@@ -59,6 +65,28 @@ class VariableProjection(Program):
     kind = "variable-projection"
 
     def _solve(self, data: SolverInput) -> Solution:
+        """Best optimum from the start values and, if there are mirror images, from these."""
+        best = self._solve_from_start(data)
+        directions = self.problem.mirrored.of_task(data.sigma, data.prescribed)
+        if not (data.mirrored and len(directions)):
+            return best
+        iterations, passive = best.iterations, best.passive
+        starts = self.problem.mirrored_starts(best.theta[None], passive[None], directions)
+        for start in starts[:, 0]:
+            image = replace(data, start=start, start_passive=passive)
+            task = Task(self.problem, self.options.loss, image)
+            try:
+                state, jacobian, count = self._descend(
+                    task, task.begin(), MAX_MIRRORED_ITERATIONS, follow=True
+                )
+            except (ClosureError, SolverError):
+                continue
+            iterations += count
+            if state.objective < best.objective * (1.0 - SAME_OBJECTIVE):
+                best = task.solution(state, jacobian, passive=state.passive, iterations=count)
+        return replace(best, iterations=iterations)
+
+    def _solve_from_start(self, data: SolverInput) -> Solution:
         """Solve directly, and with increasing weights if that fails or ends far from the prior."""
         try:
             direct = self._run(data)
@@ -99,28 +127,34 @@ class VariableProjection(Program):
             ClosureError: If the solution cannot reach a posture.
         """
         task = Task(self.problem, self.options.loss, data)
+        most = self.options.max_iterations
         start = task.begin()
         try:
-            state, jacobian, iterations = self._descend(task, start, follow=True)
+            state, jacobian, iterations = self._descend(task, start, most, follow=True)
         except (ClosureError, SolverError):
-            state, jacobian, iterations = self._descend(task, task.begin(), follow=False)
+            state, jacobian, iterations = self._descend(task, task.begin(), most, follow=False)
         return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 
     def _descend(
-        self, task: Task, begin: tuple[Iterate, ReadingLinearisation], *, follow: bool
+        self,
+        task: Task,
+        begin: tuple[Iterate, ReadingLinearisation],
+        max_iterations: int,
+        *,
+        follow: bool,
     ) -> tuple[Iterate, Array, int]:
         """Gauss-Newton iterations: the optimum, the last Jacobian and the number of iterations.
 
         Args:
             task: The task.
             begin: The start, with closed loops.
+            max_iterations: Largest number of iterations.
             follow: Let passive joints follow a step to first order.
 
         Raises:
             SolverError: If the solver does not converge.
             ClosureError: If the solution cannot reach a posture.
         """
-        max_iterations = self.options.max_iterations
         sizes, before, share = np.full(3, np.inf), None, 1.0
         state, linear = begin
         for iterations in range(1, max_iterations + 1):

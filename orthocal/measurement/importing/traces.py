@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -82,6 +82,10 @@ class BinnedTrace:
     """Motion of the tool through each bin, shape (m, n_coordinates), [m]."""
     std: float
     """Standard deviation of a reading, [m]."""
+    unused_bins: int
+    """Number of further bins, which have too few samples."""
+    unused_samples: int
+    """Number of samples in these bins."""
 
 
 def read_trace(path: str | Path, robot: Robot) -> Trace:
@@ -146,9 +150,8 @@ def bin_trace(trace: Trace) -> BinnedTrace:
     runs = _split_runs(trace.points, length)
     if not runs:
         raise SessionError("does not move; expected the commanded position of every sample")
-    n_usable = sum(len(_split_bins(length, run, 1)) for run in runs)
-    n_bins = sum(_count_bins(length, run, 1) for run in runs)
-    if 2 * n_usable < n_bins:
+    first = [b for run in runs for b in _split_bins(length, run, 1)]
+    if 2 * len(_usable(first)) < len(first):
         raise SessionError(
             f"has {len(length)} samples on a path of {length[-1] / MM:.0f} mm; expected at least "
             f"{FEWEST_SAMPLES} at different positions on every {LONGEST_BIN / MM:g} mm: a smaller "
@@ -160,7 +163,8 @@ def bin_trace(trace: Trace) -> BinnedTrace:
     deviations = trace.values - smooth
     count = 1
     while True:
-        bins_by_run = [_split_bins(length, run, count) for run in runs]
+        split = [_split_bins(length, run, count) for run in runs]
+        bins_by_run = [_usable(run_bins) for run_bins in split]
         bins = [b for run_bins in bins_by_run for b in run_bins]
         fits = [_fit_line(length[b], deviations[b]) for b in bins]
         std = float(np.sqrt(np.mean([variance for _, _, variance in fits])))
@@ -176,7 +180,8 @@ def bin_trace(trace: Trace) -> BinnedTrace:
     middle = np.array([b[index] for b, (_, index, _) in zip(bins, fits, strict=True)])
     values += smooth[middle]
     motions = np.array([trace.points[b[-1]] - trace.points[b[0]] for b in bins])
-    return BinnedTrace(trace.points[middle], values, motions, std)
+    unused = [b.size for run_bins in split for b in run_bins if b.size < FEWEST_SAMPLES]
+    return BinnedTrace(trace.points[middle], values, motions, std, len(unused), sum(unused))
 
 
 def _split_runs(points: Array, length: Array) -> list[slice]:
@@ -215,7 +220,12 @@ def _split_bins(length: Array, run: slice, count: int) -> list[Indices]:
     edges = along[0] + np.arange(1, number) / number * (along[-1] - along[0])
     moving = np.flatnonzero(np.diff(along, prepend=-1.0) > 0.0)
     bins = np.split(moving, np.searchsorted(along[moving], edges))
-    return [run.start + samples for samples in bins if samples.size >= FEWEST_SAMPLES]
+    return [run.start + samples for samples in bins]
+
+
+def _usable(bins: Sequence[Indices]) -> list[Indices]:
+    """Bins with enough samples."""
+    return [b for b in bins if b.size >= FEWEST_SAMPLES]
 
 
 def _fit_line(along: Array, values: Array) -> tuple[float, int, float]:
@@ -252,31 +262,46 @@ def _averaging_error(values: Array, counts: list[int], std: float) -> float:
     return math.sqrt(max(float(bends @ bends) / max(bends.size, 1) - noise, 0.0)) / 24.0
 
 
-def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
-    """Session in which binned traces replace the readings of their setups.
-
-    The standard deviation of their gauges becomes that of a bin.
+def bin_traces(session: Session, traces: Mapping[str, Trace]) -> dict[str, BinnedTrace]:
+    """Average traces in bins along their paths (see `bin_trace`), by setup.
 
     Args:
         session: A plan or a session.
         traces: Traces by setup.
 
     Raises:
-        SessionError: If a setup does not exist, or the machine does not reach a point.
+        SessionError: If a setup does not exist, or a trace has too few samples; names it.
     """
-    readings = [r for r in session.readings if r.setup not in traces and r.is_read]
-    read_postures = {p for r in readings for p in (r.posture, r.minus)}
-    postures = {n: p for n, p in session.postures.items() if n in read_postures}
-    stds: dict[str, list[float]] = {}
+    binned = {}
     for name, trace in traces.items():
         if name not in session.setups:
             raise SessionError(
                 f"'{name}' is not a setup; setups: {', '.join(session.setups)}", where="--trace"
             )
         try:
-            binned = bin_trace(trace)
+            binned[name] = bin_trace(trace)
         except SessionError as e:
             raise SessionError(e.problem, where=f"trace of {name}") from None
+    return binned
+
+
+def with_traces(session: Session, traces: Mapping[str, BinnedTrace]) -> Session:
+    """Session in which binned traces replace the readings of their setups.
+
+    The standard deviation of their gauges becomes that of a bin.
+
+    Args:
+        session: A plan or a session.
+        traces: Binned traces by setup.
+
+    Raises:
+        SessionError: If the machine does not reach a point.
+    """
+    readings = [r for r in session.readings if r.setup not in traces and r.is_read]
+    read_postures = {p for r in readings for p in (r.posture, r.minus)}
+    postures = {n: p for n, p in session.postures.items() if n in read_postures}
+    stds: dict[str, list[float]] = {}
+    for name, binned in traces.items():
         stds.setdefault(session.setups[name].gauge, []).append(binned.std)
         for posture, approach, value in _place_bins(session, name, binned):
             postures[posture.name] = posture
