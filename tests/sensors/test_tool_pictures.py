@@ -79,6 +79,7 @@ def test_a_dial_is_drawn_and_named_only_where_one_is_read(tmp_path, setup, with_
     (head,) = (h for h in page.iter("h3") if words(h) == "Rules for all readings")
     rules = words(head.getnext())
     assert "leave the box empty" in rules
+    assert "set the gauge zero" not in rules  # it is known
     for words_of_dials in ("bezel", "dial", "in contact"):
         assert (words_of_dials in rules) is with_dial
 

@@ -551,11 +551,16 @@ def _reading_rules(session: Session, motions: Sequence[SetupMotion]) -> list[str
     empty = "If you could not take a reading, leave the box empty."
     if not any(has_dial(setup.sensor) for setup in session.setups.values()):
         return [approach, f"Write down what the instrument shows, with its sign. {empty}"]
+    untouched = "During a setup, do not touch the bezel of the gauge or what holds it."
+    if any(setup.zero == "free" for setup in session.setups.values()):
+        untouched = (
+            "After you have set the gauge zero, do not touch the bezel, the stand or the arm of "
+            "the gauge."
+        )
     return [
         approach,
         _contact_rule(session, motions),
-        "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
-        "gauge. If the gauge was bumped, start that setup again.",
+        f"{untouched} If the gauge was bumped, start that setup again.",
         f"Write down what the dial shows, with its sign, to the nearest step of its scale. {empty}",
     ]
 
