@@ -176,7 +176,7 @@ class PeerProblem:
         in SI units: the difference step of 1.5e-8 m and rad is far above CLOSURE_TOLERANCE,
         whereas a step of 1.5e-8 tolerances would be lost in it.
         """
-        began = time.perf_counter()
+        began = time.process_time()
         found = least_squares(
             self.residuals,
             np.zeros(len(self.names)),
@@ -185,7 +185,7 @@ class PeerProblem:
             ftol=STOP,
             xtol=STOP,
         )
-        seconds = time.perf_counter() - began
+        seconds = time.process_time() - began
         if not found.success:
             raise RuntimeError(found.message)
         return PeerSolution(found.x, float(found.cost), seconds, self.evaluations)
