@@ -16,25 +16,28 @@ DOCUMENTED = $(VENV)/.installed-docs
 
 unexport PYTHONDONTWRITEBYTECODE  # processes of tests do not compile what others have compiled
 
-.PHONY: calibrate test benchmarks smoke check docs clean
+.PHONY: calibrate test suite benchmarks smoke check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED)
-	$(MAKE) --jobs 2 --output-sync check benchmarks
-	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
+	$(MAKE) --jobs 3 --output-sync check benchmarks suite
+
+suite: $(TESTED)
+	@# compiles the tests for all workers
+	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
+	@# the plus sign: what the tests print is not kept back until they have ended
+	+$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
 	  --ignore tests/benchmarks
 
-benchmarks: $(TESTED)  # not among the other tests: they compare times
+benchmarks: $(TESTED)  # in one process: they compare seconds of the processor
 	$(VENV)/bin/python -m pytest tests/benchmarks
 
 check: $(TESTED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	@# compiles the tests for all workers
-	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
 
 smoke: $(TESTED)
 	$(VENV)/bin/python .ci/smoke.py
