@@ -134,6 +134,7 @@ def test_verdict_review_exits_3_and_writes_all_files(reversed_setup):
     assert (decision.verdict, decision.exit_code) == ("review", 3)
     assert assessment.findings[0].kind == "reversed sign"
     assert assessment.findings[0].places[0].setup == "zx"
+    assert not assessment.of_kind("model error")  # the reversed signs explain the residuals
 
 
 def test_again_refuses_the_verdict_review(reversed_setup, tmp_path):
@@ -288,13 +289,16 @@ def test_accuracy_over_a_cube_and_at_points(calibrated, tmp_path):
     assert json.loads(out)["decision"]["verdict"] == "enter"
 
 
-def test_accuracy_states_a_verdict_against_entering(root, tmp_path):
-    """The first line is that of `calibrate`."""
+def test_accuracy_refuses_a_verdict_against_entering(root, tmp_path):
+    """With --anyway its first line is that of `calibrate`."""
     printed = tmp_path / "out"
     experiment = root / "examples/table1/experiment-1-printed"
     code, answer, _ = orthocal("calibrate", experiment, "--out", printed)
     assert code == 3
-    _, out, _ = orthocal("accuracy", printed)
+    code, out, err = orthocal("accuracy", printed)
+    assert (code, out) == (3, "")
+    assert err.startswith("orthocal: Do not enter offsets from these readings. ")
+    _, out, _ = orthocal("accuracy", printed, "--anyway")
     words = " ".join(answer.split())
     assert out.startswith("Do not enter offsets from these readings. ")
     assert " ".join(out.split())[:100] in words

@@ -155,8 +155,11 @@ def assess(
         if firmware
         else _entry_findings(calibration, entries, tool, keep=keep)
     )
+    fit_findings = find_fit_findings(calibration)
+    if judgement.verdict != "enter":  # mistakes explain the residuals
+        fit_findings = [f for f in fit_findings if f.kind != "model error"]
     notes = [
-        *find_fit_findings(calibration),
+        *fit_findings,
         *([_no_change_needed(entries, chosen.best)] if keep else []),
         *entry_findings,
         *([] if firmware else _compensation_findings(calibration, chosen.backlash)),

@@ -92,7 +92,8 @@ def _residuals(calibration: Calibration) -> list[Finding]:
     if stated is None:
         return [words.noise_from_residuals(calibration.sigma)]
     if noise.exceeded_by_residuals(stated):
-        return [excess(stated, "the stated scatter of the gauge")]
+        noun = "a difference" if calibration.rows_are_differences else "the gauge"
+        return [excess(stated, f"the stated scatter of {noun}")]
     if noise.exceeds_residuals(stated):
         return [words.gauge_overstated(noise.residual_sigma, stated)]
     return [words.fits(noise.residual_sigma, STATED)]

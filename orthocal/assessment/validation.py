@@ -395,11 +395,15 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
                 f"{entry.enter * factor:.3f} {unit}"
             )
     if differences:
-        raise SessionError(
-            f"{'; '.join(differences)}. The session was not measured with the offsets to enter: "
-            "enter them, measure again, and validate that session",
-            where=where,
+        verdict = assessment_of(calibration).decision.verdict
+        advice = (
+            "The session was not measured with the offsets to enter: enter them, measure again, "
+            "and validate that session"
+            if verdict == "enter"
+            else f"The verdict of the calibration is '{verdict}': its offsets are not to be "
+            "entered, so no session validates it"
         )
+        raise SessionError(f"{'; '.join(differences)}. {advice}", where=where)
     return session
 
 

@@ -13,6 +13,7 @@ from typer import Argument, Exit
 import orthocal
 from orthocal.cli.forward import put_assumed
 from orthocal.cli.options import (
+    Anyway,
     Approach,
     CalibrationPath,
     HalfSideMm,
@@ -40,6 +41,7 @@ def accuracy(
     temperature: Temperature = None,
     payload: Payload = None,
     json: Json = False,
+    anyway: Anyway = False,
 ) -> None:
     """Print the tool error over the workspace, or at points.
 
@@ -48,11 +50,13 @@ def accuracy(
     --approach, --temperature and --payload replace the conditions of use that the robot's YAML
     states.
 
-    Exit code 3: some points cannot be reached; they are named, and their cells are empty.
+    Exit code 3: the verdict is not `enter`; the reason is printed. Or some points cannot be
+    reached; they are named, and their cells are empty.
 
     Args:
         points (TARGETS.csv): Columns of the tool: x_mm, y_mm, z_mm.
     """
+    from orthocal.export.formats import require_entering
     from orthocal.kinematics.workspace import cube
     from orthocal.measurement.files.coordinate_tables import read_points
     from orthocal.output.text.accuracy import (
@@ -64,6 +68,8 @@ def accuracy(
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
     result = orthocal.load_calibration(calibration)
+    if not anyway:
+        require_entering(result)
     conditions = read_conditions(
         result.robot, approach=approach, temperature=temperature, payload=payload
     )

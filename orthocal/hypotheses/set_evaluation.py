@@ -98,24 +98,35 @@ class SetEvaluator:
 
         Sets with machine shifts start from the linearisation without anomalies.
         """
-        model, shifts = self.model, [_known_shifts(terms) for terms in term_sets]
-        if any(t.shift is not None for terms in term_sets for t in terms):
-            sound = self.sound.about
-            points = [LinearisationPoint(sound.theta, s, sound.passive) for s in shifts if s]
-            shifted = iter(model.linearise_all(points, keep_jacobian=True))
+        shifts = [_known_shifts(terms) for terms in term_sets]
+        shifted = iter(self._linearise_shifted([s for s in shifts if s]))
         states = []
         for terms, known in zip(term_sets, shifts, strict=True):
-            about = start
-            if known:
-                about = next(shifted) or model.linearise(
-                    sound.theta, known, sound.passive, keep_jacobian=True
-                )
-            elif any(map(_is_unknown_shift, terms)):
-                about = sound
-            states.append(
-                self._evaluate_about(terms, about, np.zeros(sum(map(_is_unknown_shift, terms))))
-            )
+            unknown = sum(map(_is_unknown_shift, terms))
+            about = next(shifted) if known else self.sound.about if unknown else start
+            state = self._evaluate_about(terms, about or start, np.zeros(unknown))
+            states.append(state if about else _without_likelihood(state))
         return states
+
+    def _linearise_shifted(
+        self, shifts: Sequence[list[MachineShift]]
+    ) -> list[ModelLinearisation | None]:
+        """Linearise with known machine shifts.
+
+        It is about the errors without anomalies, or the reference where their readings are not
+        possible, as for a tip that misses its rod. None where neither is possible.
+        """
+        if not shifts:
+            return []
+        found: list[ModelLinearisation | None] = [None] * len(shifts)
+        for about in (self.sound.about, self.reference):
+            missing = [i for i, one in enumerate(found) if one is None]
+            points = [LinearisationPoint(about.theta, shifts[i], about.passive) for i in missing]
+            for i, one in zip(
+                missing, self.model.linearise_all(points, keep_jacobian=True), strict=True
+            ):
+                found[i] = one
+        return found
 
     def _next_point(self, state: HypothesisSet, *, first: bool) -> LinearisationPoint | None:
         """Errors that a set implies, to linearise about; None if they are too near or too far."""
@@ -164,11 +175,11 @@ class SetEvaluator:
             for t, a in zip(terms, amounts, strict=True)
             if t.shift is not None and not t.known
         ]
-        if max(changes, default=0.0) > LARGEST_CHANGE:
-            score = replace(score, log_likelihood=-np.inf)
-        return HypothesisSet(
+        state = HypothesisSet(
             tuple(terms), score, about, remaining, correct_rows(rows, terms, amounts), amounts, stds
         )
+        excessive = max(changes, default=0.0) > LARGEST_CHANGE
+        return _without_likelihood(state) if excessive else state
 
     def _vectors(
         self, terms: Sequence[Term], about: ModelLinearisation
@@ -193,6 +204,11 @@ class SetEvaluator:
             np.concatenate(silent) if silent else None,
             np.array(steps).reshape(len(steps), -1 if steps else about.expected.size),
         )
+
+
+def _without_likelihood(state: HypothesisSet) -> HypothesisSet:
+    """The set as one that cannot be true about its linearisation."""
+    return replace(state, score=replace(state.score, log_likelihood=-np.inf))
 
 
 def _is_unknown_shift(term: Term) -> bool:

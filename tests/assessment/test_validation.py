@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -161,6 +162,14 @@ def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
 def test_a_session_with_other_offsets_is_refused(paper, experiment_3):
     with pytest.raises(SessionError, match="not measured with the offsets to enter"):
         validate_calibration(paper, experiment_3.with_controller(np.zeros(3)))
+
+
+def test_offsets_of_a_doubtful_calibration_are_not_to_be_entered(paper, experiment_3):
+    assessment = assessment_of(paper)
+    doubtful = replace(assessment.decision, verdict="review")
+    calibration = replace(paper, assessment=replace(assessment, decision=doubtful))
+    with pytest.raises(SessionError, match="is 'review': its offsets are not to be entered"):
+        validate_calibration(calibration, experiment_3.with_controller(np.zeros(3)))
 
 
 def test_only_identified_offsets_must_be_active(experiment_3):
@@ -333,6 +342,13 @@ def test_values_to_enter_after_a_mistake(plan, mistake, kind, by_calibration):
     assert {p.parameter for p in cause.places} == drives
     if kind == "offsets not entered":
         assert cause.numbers["x_slide_active_mm"] == 0.0
+    else:
+        stated, found, limit = map(
+            float,
+            re.search(r"is not (\S+) mm as stated, but (\S+) ± (\S+) mm", cause.text).groups(),
+        )
+        assert stated == pytest.approx(1e3 * right[1], abs=5e-4)
+        assert found == pytest.approx(1e3 * mistake(right)[1], abs=1.5 * limit)
     text = " ".join(summarize(result).split())
     assert cause.text in text
     entered = np.array([e.enter for e in result.enter])

@@ -15,6 +15,7 @@ from made_mistakes import sound_session
 from orthocal import draw_errors, simulate_session
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.compensation import JointTrim
+from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.families.sessions import (
     divide_sessions,
@@ -83,6 +84,22 @@ def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
     else:  # the change of the machine that has the same effect
         assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
     assert found.explained
+
+
+@pytest.mark.parametrize(("at_nominal", "kinds"), [(True, ["offsets reversed"]), (False, [])])
+def test_readings_that_are_not_possible_do_not_end_the_search(plan, monkeypatch, at_nominal, kinds):
+    """Where the tip would miss its rod after a change, which needs large offsets."""
+    assemble = LinearModel._assemble
+
+    def assemble_possible(self, theta, of_session, *predicted, **options):
+        if of_session.any() and (theta.any() or not at_nominal):
+            raise SessionError("the predicted reading is not finite")
+        return assemble(self, theta, of_session, *predicted, **options)
+
+    session = measure_twice(plan, -ENTERED)
+    monkeypatch.setattr(LinearModel, "_assemble", assemble_possible)
+    explanations = [a.explanation for a in find_anomalies(session).found]
+    assert [e.kind for e in explanations if e.kind.startswith("offsets")] == kinds
 
 
 BEFORE = np.array([-0.5e-3, -1.0e-3, 0.3e-3])

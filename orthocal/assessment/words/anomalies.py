@@ -392,10 +392,7 @@ def _text(session: Session, e: Explanation) -> str:
             f"{mm(e.amount or 0.0)} mm: {_amounts(e)}"
         ),
         "machine changed": lambda: _changed(session, e),
-        "offset of one drive": lambda: (
-            f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is "
-            f"not the stated one{_amount_of_change(session, e)}"
-        ),
+        "offset of one drive": lambda: _other_offset(session, e),
         "offsets not entered": lambda: _entered(e, "not entered"),
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
         "offsets entered twice": lambda: _entered(e, "added twice"),
@@ -563,6 +560,23 @@ def _amount_of_change(session: Session, e: Explanation) -> str:
     p = session.robot.parameters[e.parameters[0]]
     uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
     return f" by {signed(e.amount * p.edge_factor)}{uncertainty} {p.edge_unit}"
+
+
+def _other_offset(session: Session, e: Explanation) -> str:
+    """Clause about a drive with another offset than the stated one.
+
+    An offset that is too small by an amount has the effect of an offset error of this amount.
+    """
+    text = f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is not"
+    if e.amount is None:
+        return f"{text} the stated one"
+    setup = next(i for i, label in enumerate(session.labels) if label in e.sessions)
+    drive = [d.name for d in session.robot.drives].index(e.drives[0])
+    p = session.robot.parameters[e.parameters[0]]
+    stated = float((session.robot.drive_zero - session.zero_drives[setup])[drive])
+    uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
+    found = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
+    return f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}"
 
 
 def _entered(e: Explanation, how: str) -> str:

@@ -249,8 +249,8 @@ def _next_step(
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
             words = (
-                "enter these offsets only if the controller corrects nothing else. Otherwise leave "
-                "the offsets, and correct all identified errors in LinuxCNC or in programs."
+                "choose one: enter these offsets; or leave the present ones, and correct all "
+                "identified errors in LinuxCNC or in programs."
             )
         active = "" if unchanged else " --offsets active"
         return words, (
