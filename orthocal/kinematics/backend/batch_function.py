@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from typing import Literal
 
@@ -81,7 +81,7 @@ class BatchFunction:
     @cached_property
     def layout(self) -> Layout:
         """Outputs of the function, from disk if the function is large."""
-        key = f"layout {self._sparse}\n{self._key}"
+        key = f"layout {[f.name for f in fields(Layout)]} {self._sparse}\n{self._key}"
         content = None if self._key is None else disk_cache.load(key)
         if content is not None:
             return Layout(**json.loads(content))
