@@ -61,7 +61,7 @@ class GeometryErrors(Effect):
         components: dict[Placement, list[ca.SX]] = {}
         for e in self.errors:
             twist = components.setdefault(self.robot.placement_of(e), [ca.SX(1, 1)] * 6)
-            twist[e.axis] = errors[e.name]
+            twist[e.axis] = twist[e.axis] + errors[e.name]
         return {placement: ca.vertcat(*twist) for placement, twist in components.items()}
 
 

@@ -216,9 +216,6 @@ def expect_further_hour(
     nothing = FurtherHour(math.nan, ())
     if calibration.only_offsets:
         return nothing
-    from orthocal.planning.expected_error import ToolForecast, state_noise
-    from orthocal.planning.sensor_gains import find_sensor_gains
-
     session = restore_session(calibration)
     parameters, scale = session.robot.parameters, calibration.tolerance_scale
     selection = select_parameters(
