@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import Literal
 
 import numpy as np
+import scipy
 
 from orthocal import __version__
 from orthocal.arrays import Array
@@ -254,8 +255,8 @@ def hold_parameter(robot: Robot, name: str, value: float) -> ParameterEstimate:
 @cache
 def _versions() -> Versions:
     """Versions of the software."""
-    names = ("pin", "casadi", "numpy", "scipy")
-    return Versions(__version__, platform.python_version(), *(version(name) for name in names))
+    libraries = (version("pin"), version("casadi"), np.__version__, scipy.__version__)
+    return Versions(__version__, platform.python_version(), *libraries)
 
 
 def _session_record(session: Session) -> SessionRecord:

@@ -58,10 +58,11 @@ class GeometryErrors(Effect):
 
     def placements(self, errors: Symbols, conditions: Symbols) -> Mapping[Placement, ca.SX]:
         """Twists of placements (see `Effect.placements`)."""
-        twists: dict[Placement, ca.SX] = {}
+        components: dict[Placement, list[ca.SX]] = {}
         for e in self.errors:
-            twists.setdefault(self.robot.placement_of(e), ca.SX(6, 1))[e.axis] += errors[e.name]
-        return twists
+            twist = components.setdefault(self.robot.placement_of(e), [ca.SX(1, 1)] * 6)
+            twist[e.axis] = twist[e.axis] + errors[e.name]
+        return {placement: ca.vertcat(*twist) for placement, twist in components.items()}
 
 
 def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:

@@ -47,7 +47,8 @@ def express_machine(
     elementary: dict[str, ca.SX] = dict.fromkeys(robot.parameters.elementary, ca.SX(1, 1))
     for name, value in errors.items():
         for term, coefficient in robot.parameters[name].terms:
-            elementary[term] = elementary[term] + coefficient * value
+            part = value if coefficient == 1.0 else coefficient * value  # a product costs time
+            elementary[term] = elementary[term] + part
     stated = {**neutral_conditions(robot), "coordinates": commanded, **(conditions or {})}
     actuated, twists = commanded, dict[Placement, ca.SX]()
     for effect in reversed(robot_effects(robot)):  # gain and offset of the drives act last

@@ -11,12 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from orthocal.effects.backlash import Backlash
-from orthocal.effects.compliance import Compliance
-from orthocal.effects.drift import Drift
 from orthocal.effects.protocol import Effect
-from orthocal.effects.screw import Screw
-from orthocal.effects.thermal import Thermal
 from orthocal.errors import OrthocalError
 from orthocal.runtime.registry import Registry
 
@@ -31,12 +26,17 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     return offered
 
 
-BUILT_IN: tuple[type[Effect], ...] = (Backlash, Thermal, Screw, Drift, Compliance)
-"""Built-in effects in the order of a machine; effects on drives act in the reverse order."""
+BUILT_IN = {
+    "backlash": "orthocal.effects.backlash:Backlash",
+    "thermal": "orthocal.effects.thermal:Thermal",
+    "screw": "orthocal.effects.screw:Screw",
+    "drift": "orthocal.effects.drift:Drift",
+    "compliance": "orthocal.effects.compliance:Compliance",
+}
+"""Built-in effects and their classes, in the order of a machine; effects on drives act in the
+reverse order. Each class is imported on first use."""
 
-_EFFECTS = Registry[type[Effect]](
-    GROUP, "effect", _read_effect, {effect.name: effect for effect in BUILT_IN}
-)
+_EFFECTS = Registry[type[Effect]](GROUP, "effect", _read_effect, BUILT_IN)
 
 
 def register_effect(effect: type[Effect]) -> None:
@@ -56,7 +56,7 @@ def effect_names() -> tuple[str, ...]:
 
 def order_effects(names: Iterable[str]) -> tuple[str, ...]:
     """Names of effects without repetition: built-in ones in their order, then the others."""
-    order = {effect.name: i for i, effect in enumerate(BUILT_IN)}
+    order = {name: i for i, name in enumerate(BUILT_IN)}
     return tuple(sorted(dict.fromkeys(names), key=lambda name: order.get(name, len(order))))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import secrets
 import stat
 from codecs import getincrementaldecoder
 from collections.abc import Iterable, Iterator, Mapping
@@ -392,7 +391,7 @@ def _stage(temporary: Path, parts: Iterable[bytes], *, like: Path) -> None:
 
 
 def _temporary_name() -> str:
-    return f".orthocal-{os.getpid()}-{secrets.token_hex(8)}.tmp"
+    return f".orthocal-{os.getpid()}-{os.urandom(8).hex()}.tmp"
 
 
 def _clean_up(folder: Path) -> None:

@@ -314,7 +314,7 @@ class RobotFunctions:
     ) -> BatchFunction:
         """Batch function of the symbols; `matrices` and `sparse` are indices of outputs."""
         return BatchFunction(
-            self._function(name, outputs, sparse=sparse),
+            lambda: self._function(name, outputs, sparse=sparse),
             matrices=[f"y{i}" for i in matrices],
             sparse=[f"y{i}" for i in sparse],
             key=function_key(self.robot, name),

@@ -29,6 +29,9 @@ SERIES_BELOW = 0.25
 SERIES_TERMS = 9
 """Terms of a series: the first omitted one is below 1e-21 at SERIES_BELOW."""
 
+_INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(5 + 2 * SERIES_TERMS))
+"""1/n!, for the series of five coefficients."""
+
 LOGARITHM_SERIES_ABOVE = 0.999
 """Cosine above which the coefficients of the logarithm come from their series."""
 
@@ -190,8 +193,7 @@ def _coefficients(m: _Operations, square: Operand, count: int) -> list[Operand]:
 
 def _series(square: Operand, first: int) -> Operand:
     """Series Σ (−θ²)^k/(first + 2k)! of a squared angle θ²."""
-    coefficients = (1.0 / math.factorial(first + 2 * k) for k in range(SERIES_TERMS))
-    return _polynomial(-square, tuple(coefficients))
+    return _polynomial(-square, _INVERSE_FACTORIALS[first : first + 2 * SERIES_TERMS : 2])
 
 
 def _polynomial(x: Operand, coefficients: tuple[float, ...]) -> Operand:

@@ -150,6 +150,6 @@ class ToolSensitivity:
         result = np.zeros((*multiplier.shape[:2], self._functions.n_twists))
         if columns.size:
             used, starts = np.unique(columns, return_index=True)
-            products = multiplier[:, :, rows] * nonzeros[:, None, :]
+            products = np.take(multiplier, rows, axis=2) * nonzeros[:, None, :]
             result[:, :, used] = np.add.reduceat(products, starts, axis=2)
         return result

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -126,7 +125,7 @@ def _read(folder: int, key: str) -> bytes | None:
 
 
 def _write(folder: int, key: str, content: bytes) -> None:
-    temporary = f"{secrets.token_hex(8)}.part"
+    temporary = f"{os.urandom(8).hex()}.part"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINKS
     descriptor = os.open(temporary, flags, 0o600, dir_fd=folder)
     try:

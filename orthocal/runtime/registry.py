@@ -14,14 +14,14 @@ Kind = TypeVar("Kind")
 
 
 class Registry(Generic[Kind]):
-    """Kinds by name; those of installed packages are loaded on first use.
+    """Kinds by name; those that are not registered are loaded on first use.
 
     Args:
         group: Group of the entry points of packages; an entry point has the name of its kind.
         noun: Noun for a kind in messages, such as sensor.
         read: Function from a name and the object of an entry point to a kind. It may raise any
             error for an invalid object.
-        built_in: Kinds of orthocal.
+        built_in: Kinds of orthocal, as `module:Class` by name.
     """
 
     def __init__(
@@ -29,23 +29,26 @@ class Registry(Generic[Kind]):
         group: str,
         noun: str,
         read: Callable[[str, Any], Kind],
-        built_in: Mapping[str, Kind],
+        built_in: Mapping[str, str],
     ) -> None:
         self._group, self._noun, self._read = group, noun, read
-        self._kinds = dict(built_in)
+        self._registered: dict[str, Kind] = {}
+        self._built_in = {name: EntryPoint(name, place, group) for name, place in built_in.items()}
 
     def register(self, name: str, kind: Kind) -> None:
         """Add a kind; it replaces a kind of the same name."""
-        self._kinds[name] = kind
+        self._registered[name] = kind
 
     def unregister(self, name: str) -> None:
         """Remove a kind if it exists."""
-        self._kinds.pop(name, None)
+        self._registered.pop(name, None)
+        self._built_in.pop(name, None)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all kinds, including those of installed packages."""
-        return tuple(dict.fromkeys([*self._kinds, *(e.name for e in self._entry_points)]))
+        installed = (e.name for e in self._entry_points)
+        return tuple(dict.fromkeys([*self._built_in, *self._registered, *installed]))
 
     @property
     def _entry_points(self) -> tuple[EntryPoint, ...]:
@@ -62,8 +65,11 @@ class Registry(Generic[Kind]):
         Raises:
             OrthocalError: If the kind is unknown, or its package cannot be loaded.
         """
-        if isinstance(name, str) and name in self._kinds:
-            return self._kinds[name]
+        if isinstance(name, str) and name in self._registered:
+            return self._registered[name]
+        if isinstance(name, str) and name in self._built_in:
+            self._registered[name] = self._built_in[name].load()
+            return self._registered[name]
         point = next((e for e in self._entry_points if e.name == name), None)
         if point is None:
             expected = f"expected one of {', '.join(self.names)}" if self.names else "there is none"

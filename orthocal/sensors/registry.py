@@ -16,15 +16,9 @@ from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
 from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
-from orthocal.sensors.ball_bar import BallBar
-from orthocal.sensors.distance import Distance
-from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.sensors.points import Points
-from orthocal.sensors.probe import Probe
 from orthocal.sensors.protocol import Sensor, SetupKeys
-from orthocal.sensors.tool_indicator import ToolIndicator
 
-DEFAULT = LegIndicator.kind
+DEFAULT = "leg"
 """Kind of sensor of a setup that states none."""
 
 GROUP = "orthocal.sensors"
@@ -38,17 +32,17 @@ def _read_sensor(name: str, offered: type[Sensor]) -> type[Sensor]:
     return offered
 
 
-BUILT_IN: tuple[type[Sensor], ...] = (
-    LegIndicator,
-    BallBar,
-    Distance,
-    ToolIndicator,
-    Points,
-    Probe,
-)
-_SENSORS = Registry[type[Sensor]](
-    GROUP, "sensor", _read_sensor, {sensor.kind: sensor for sensor in BUILT_IN}
-)
+BUILT_IN = {
+    "leg": "orthocal.sensors.leg_indicator:LegIndicator",
+    "ball_bar": "orthocal.sensors.ball_bar:BallBar",
+    "distance": "orthocal.sensors.distance:Distance",
+    "tool_indicator": "orthocal.sensors.tool_indicator:ToolIndicator",
+    "points": "orthocal.sensors.points:Points",
+    "probe": "orthocal.sensors.probe:Probe",
+}
+"""Built-in kinds and their classes, which are imported on first use."""
+
+_SENSORS = Registry[type[Sensor]](GROUP, "sensor", _read_sensor, BUILT_IN)
 
 
 def register_sensor(sensor: type[Sensor]) -> None:

@@ -116,25 +116,48 @@ def test_casadi_evaluates_where_the_interpreter_cannot_be_compiled(orthoglide, m
 def test_instructions_are_cached_on_disk(orthoglide, tmp_path, monkeypatch):
     monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
     function = robot_functions(orthoglide).closure_by_passive.function
-    assert function.n_instructions() > llvm.MIN_CACHED
-    list_instructions, expected, listed = llvm.list_instructions, None, []
-    expected = list_instructions(function)
-
-    def counted(function):
-        listed.append(function)
-        return list_instructions(function)
-
-    monkeypatch.setattr(llvm, "list_instructions", counted)
-    for _ in range(3):
-        found = llvm.load_program(function, key="a key")
-        assert len(listed) == 1
-        assert found.n_work == expected.n_work
-        for name in ("table", "constants", "output_starts"):
-            ours, theirs = getattr(found, name), getattr(expected, name)
-            assert ours.dtype == theirs.dtype
-            assert np.array_equal(ours, theirs)
+    sizes = function.n_instructions(), function.n_out()
+    assert llvm.load_program("a key", *sizes) is None
+    expected = llvm.list_instructions(function)
+    llvm.store_program("a key", expected)
+    found = llvm.load_program("a key", *sizes)
+    assert found.n_work == expected.n_work
+    for name in ("table", "constants", "output_starts"):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        assert ours.dtype == theirs.dtype
+        assert np.array_equal(ours, theirs)
     # content of another length is not used, whatever its checksum says
-    content = llvm.disk_cache.load
-    monkeypatch.setattr(llvm.disk_cache, "load", lambda key: content(key)[:-8])
-    assert np.array_equal(llvm.load_program(function, key="a key").table, expected.table)
-    assert len(listed) == 2
+    assert llvm.load_program("a key", sizes[0] + 1, sizes[1]) is None
+    assert llvm.load_program("a key", sizes[0], sizes[1] + 1) is None
+
+
+def test_a_large_function_is_loaded_only_for_casadi(orthoglide, tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
+    original, where = robot_functions(orthoglide).closure_jacobian, points(orthoglide, 20)
+    assert original.layout.n_instructions > llvm.MIN_CACHED
+    loaded = []
+
+    def load():
+        loaded.append(True)
+        return original.function
+
+    def fresh():
+        return BatchFunction(load, matrices=["y1", "y2"], sparse=["y3"], key="a key")
+
+    expected = original.evaluate(*where, backend="casadi")
+    for times in (1, 1):  # the first call stores layout and instructions
+        batch = fresh()
+        assert_same(batch.evaluate(*where, backend="llvm"), expected)
+        for ours, theirs in zip(batch.pattern("y3"), original.pattern("y3"), strict=True):
+            assert np.array_equal(ours, theirs)
+        assert len(loaded) == times
+    assert_same(fresh().evaluate(*where, backend="casadi"), expected)
+    assert len(loaded) == 2
+
+
+def test_a_small_function_is_not_cached(tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
+    x = ca.SX.sym("x")
+    batch = BatchFunction(lambda: ca.Function("small", [x], [2.0 * x]), key="a key")
+    assert_same(batch.evaluate([[3.0]], backend="llvm"), (np.array([[6.0]]),))
+    assert not (tmp_path / "cache").exists()

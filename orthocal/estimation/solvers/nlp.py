@@ -8,7 +8,7 @@ build time does not grow with the session. The functions are cached in memory an
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import casadi as ca
@@ -180,7 +180,8 @@ class ProgramFunctions:
         variables = np.hstack([theta, self._local_variables(expressions)])
         local = variables[:, n_t:]
         arguments, masks = self._reading_arguments(expressions, local, x, p, shared)
-        functions = self._reading_functions(expressions)
+        names = ("objective", "gradient", "hessian")
+        functions = self._reading_functions(expressions, names)
 
         total = functions["objective"].map(count, masks, [True])(*arguments)
         # the parts of gradient and Hessian for θ̂ are sums over readings
@@ -225,7 +226,7 @@ class ProgramFunctions:
         for expressions in self._symbolic.readings:
             local = self._local_variables(expressions)
             arguments, masks = self._reading_arguments(expressions, local, x, p, shared)
-            function = self._reading_functions(expressions)["reading"]
+            function = self._reading_functions(expressions, ("reading",))["reading"]
             values.append(
                 ca.vec(function.map(expressions.group.entries.size, masks, [False])(*arguments))
             )
@@ -279,8 +280,10 @@ class ProgramFunctions:
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
         return cached_function(problem.robot, f"program {digest}", build)
 
-    def _reading_functions(self, expressions: ReadingExpressions) -> dict[str, ca.Function]:
-        """Cached functions of a reading: value, objective, gradient and Hessian."""
+    def _reading_functions(
+        self, expressions: ReadingExpressions, names: Sequence[str]
+    ) -> dict[str, ca.Function]:
+        """Some of the cached functions of a reading, by name (see `_build_reading`)."""
         sensor = expressions.group.reading.name
         built: dict[str, ca.Function] = {}
 
@@ -289,10 +292,7 @@ class ProgramFunctions:
                 built.update(self._build_reading(expressions))
             return built[name]
 
-        return {
-            name: self._cached(f"{name} of {sensor}", partial(build, name))
-            for name in ("reading", "objective", "gradient", "hessian")
-        }
+        return {name: self._cached(f"{name} of {sensor}", partial(build, name)) for name in names}
 
     def _build_reading(self, expressions: ReadingExpressions) -> dict[str, ca.Function]:
         """Functions of a reading by name: value, objective, gradient and Hessian."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from typing import Literal
 
@@ -13,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
 from orthocal.kinematics.backend import llvm
+from orthocal.runtime import disk_cache
 
 Backend = Literal["casadi", "llvm"]
 
@@ -27,6 +30,19 @@ MIN_POINTS, MIN_OPERATIONS = 3, 2e3
 for 16 points as CasADi for two or three, and 0.03 s once to start."""
 
 
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Outputs and size of a function, which suffice to run its instructions from disk."""
+
+    n_instructions: int
+    names: Sequence[str]
+    """Names of the outputs."""
+    shapes: Sequence[tuple[int, int]]
+    """Rows and columns of each output; the number of nonzeros and 1 for a sparse one."""
+    patterns: Mapping[str, tuple[Sequence[int], Sequence[int]]]
+    """Rows and columns of the nonzeros of each sparse output."""
+
+
 class BatchFunction:
     """CasADi function of column vectors that is evaluated at many points.
 
@@ -34,38 +50,57 @@ class BatchFunction:
     choice depends only on the function, the number of points and whether llvmlite is installed.
 
     Args:
-        function: Function whose inputs are column vectors.
+        function: Function whose inputs are column vectors, or one that loads it. With a key a
+            large function is loaded only if CasADi evaluates it, because that takes much longer
+            than loading its instructions.
         matrices: Names of the outputs that are matrices even if they have one column.
         sparse: Names of the outputs whose nonzeros are returned, in the order of `pattern`. Other
             outputs are dense.
-        key: Key of the function's instructions on disk; not cached by default.
+        key: Key of the function's layout and instructions on disk; not cached by default.
     """
 
     def __init__(
         self,
-        function: ca.Function,
+        function: ca.Function | Callable[[], ca.Function],
         *,
         matrices: Sequence[str] = (),
         sparse: Sequence[str] = (),
         key: str | None = None,
     ) -> None:
-        self.function = _densified(function, sparse=sparse)
-        self._shapes = [
-            (function.nnz_out(i), 1) if name in sparse else function.size_out(i)
-            for i, name in enumerate(function.name_out())
-        ]
-        self._matrices = frozenset(function.index_out(name) for name in matrices)
-        self._key = key
-        self._patterns: dict[str, tuple[Indices, Indices]] = {}
+        self._given, self._key = function, key
+        self._matrices, self._sparse = frozenset(matrices), tuple(sparse)
         self._local = threading.local()
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The function, with dense outputs except the sparse ones."""
+        given = self._given
+        function = given if isinstance(given, ca.Function) else given()
+        return _densified(function, sparse=self._sparse)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Outputs of the function, from disk if the function is large."""
+        key = f"layout {[f.name for f in fields(Layout)]} {self._sparse}\n{self._key}"
+        content = None if self._key is None else disk_cache.load(key)
+        if content is not None:
+            return Layout(**json.loads(content))
+        layout = _lay_out(self.function, sparse=self._sparse)
+        if self._key is not None and layout.n_instructions >= llvm.MIN_CACHED:
+            disk_cache.store(key, json.dumps(asdict(layout)).encode())
+        return layout
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
-        if name not in self._patterns:
-            sparsity = self.function.sparsity_out(self.function.index_out(name))
-            rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
-            self._patterns[name] = rows, columns
         return self._patterns[name]
+
+    @cached_property
+    def _patterns(self) -> dict[str, tuple[Indices, Indices]]:
+        """Patterns of the sparse outputs as arrays, by name."""
+        return {
+            name: (np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64))
+            for name, (rows, columns) in self.layout.patterns.items()
+        }
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
         """Evaluate the function at K points.
@@ -79,7 +114,7 @@ class BatchFunction:
             shape (K, rows), sparse outputs (K, nnz).
         """
         count = self._count(inputs)
-        large = count >= MIN_POINTS and self._n_instructions * count >= MIN_OPERATIONS
+        large = count >= MIN_POINTS and self.layout.n_instructions * count >= MIN_OPERATIONS
         fast = large and llvm.is_installed()
         return self.evaluate(*inputs, backend="llvm" if fast else "casadi")
 
@@ -96,9 +131,10 @@ class BatchFunction:
         if nonzeros is None:
             nonzeros = self._run_casadi(arrays, count)
         results = []
-        for i, (values, (rows, columns)) in enumerate(zip(nonzeros, self._shapes, strict=True)):
+        outputs = zip(nonzeros, self.layout.names, self.layout.shapes, strict=True)
+        for values, name, (rows, columns) in outputs:
             matrix = values.reshape(count, columns, rows)
-            column = columns == 1 and i not in self._matrices
+            column = columns == 1 and name not in self._matrices
             results.append(np.asarray(matrix[:, 0] if column else matrix.transpose(0, 2, 1)))
         return tuple(results)
 
@@ -109,18 +145,18 @@ class BatchFunction:
         return 0 if 0 in counts else max(counts, default=1)
 
     @cached_property
-    def _n_instructions(self) -> int:
-        """Number of instructions of the function."""
-        return int(self.function.n_instructions())
-
-    @cached_property
     def _program(self) -> llvm.Program | None:
         """Instructions of the function; None if the LLVM backend lacks one of them."""
-        return llvm.load_program(self.function, key=self._key)
+        key = self._key if self.layout.n_instructions >= llvm.MIN_CACHED else None
+        sizes = self.layout.n_instructions, len(self.layout.names)
+        program = None if key is None else llvm.load_program(key, *sizes)
+        if program is None and (program := llvm.list_instructions(self.function)) and key:
+            llvm.store_program(key, program)
+        return program
 
     def _run_casadi(self, arrays: Sequence[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""
-        results = [np.empty((count, rows * columns)) for rows, columns in self._shapes]
+        results = [np.empty((count, rows * columns)) for rows, columns in self.layout.shapes]
         first = 0
         while first < count:
             size = self._block_size(count - first)
@@ -138,7 +174,7 @@ class BatchFunction:
         """Points of the next call; may exceed the remaining ones if that saves calls."""
         if count >= LARGE_BLOCK:
             return LARGE_BLOCK
-        surplus = (SMALL_BLOCK - count) * self._n_instructions
+        surplus = (SMALL_BLOCK - count) * self.layout.n_instructions
         return SMALL_BLOCK if surplus <= (count - 1) * CALL_COST else 1
 
     def _block(self, size: int) -> _MappedBlock:
@@ -167,6 +203,21 @@ class _MappedBlock:
             self._buffer.set_arg(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
         for i, a in enumerate(self.outputs):
             self._buffer.set_res(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
+
+
+def _lay_out(function: ca.Function, *, sparse: Sequence[str]) -> Layout:
+    """Layout of a function with sparse outputs."""
+    names = function.name_out()
+    patterns = {name: function.sparsity_out(name).get_triplet() for name in sparse}
+    return Layout(
+        n_instructions=int(function.n_instructions()),
+        names=names,
+        shapes=[
+            (function.nnz_out(name), 1) if name in sparse else function.size_out(name)
+            for name in names
+        ],
+        patterns=patterns,
+    )
 
 
 def _densified(function: ca.Function, *, sparse: Sequence[str]) -> ca.Function:

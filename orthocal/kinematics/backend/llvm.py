@@ -27,7 +27,7 @@ LANES = 16
 """Points for which one instruction is executed at once."""
 
 MIN_CACHED = 1000
-"""Smallest number of instructions of a program that is cached on disk."""
+"""Smallest number of instructions of a function whose program is cached on disk."""
 
 _COMPUTED = {
     "ASSIGN": "{y} = select i1 true, {row} {a}, {row} {a}",
@@ -87,27 +87,16 @@ def is_installed() -> bool:
     return find_spec("llvmlite") is not None
 
 
-def load_program(function: ca.Function, *, key: str | None = None) -> Program | None:
-    """Load the instructions of a function from disk, or list them; None if one is unknown.
+def load_program(key: str, n_instructions: int, n_outputs: int) -> Program | None:
+    """Load the instructions of a function from disk; None if they are absent or do not fit.
 
     Args:
-        function: Function of SX expressions.
-        key: Key of the function on disk; not cached by default.
+        key: Key of the function.
+        n_instructions: Number of its instructions.
+        n_outputs: Number of its outputs.
     """
-    if key is None or function.n_instructions() < MIN_CACHED:
-        return list_instructions(function)
-    key = f"instructions {_CODES}\n{key}"
-    program = _decode(disk_cache.load(key), function)
-    if program is None and (program := list_instructions(function)) is not None:
-        arrays = program.table, program.constants, np.array(program.n_work), program.output_starts
-        disk_cache.store(key, b"".join(a.tobytes() for a in arrays))
-    return program
-
-
-def _decode(content: bytes | None, function: ca.Function) -> Program | None:
-    """Decode a program from disk; None if it does not fit the function."""
-    n, outputs = function.n_instructions(), function.n_out()
-    if content is None or len(content) != 24 * n + 8 * (outputs + 2):
+    content, n = disk_cache.load(_disk_key(key)), n_instructions
+    if content is None or len(content) != 24 * n + 8 * (n_outputs + 2):
         return None
     table, constants, numbers = np.split(np.frombuffer(content, np.uint8), [16 * n, 24 * n])
     n_work, *starts = numbers.view(np.int64)
@@ -117,6 +106,16 @@ def _decode(content: bytes | None, function: ca.Function) -> Program | None:
         int(n_work),
         np.array(starts, dtype=np.int64),
     )
+
+
+def store_program(key: str, program: Program) -> None:
+    """Store the instructions of a function on disk."""
+    arrays = program.table, program.constants, np.array(program.n_work), program.output_starts
+    disk_cache.store(_disk_key(key), b"".join(a.tobytes() for a in arrays))
+
+
+def _disk_key(key: str) -> str:
+    return f"instructions {_CODES}\n{key}"
 
 
 def list_instructions(function: ca.Function) -> Program | None:

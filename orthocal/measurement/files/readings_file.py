@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, read_text
@@ -29,11 +30,13 @@ from orthocal.io.tables.numerals import (
     parse_numeral,
     plain_minus,
 )
-from orthocal.io.tables.table import Table, read_table
 from orthocal.measurement.files.session_keys import MOST_READINGS
-from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
 from orthocal.text import composed, shorten
 from orthocal.units import trim_zeros
+
+if TYPE_CHECKING:
+    from orthocal.io.tables.table import Table
+    from orthocal.measurement.importing.headings import Columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,6 +282,9 @@ def _read_spreadsheet_table(path: Path, content: bytes) -> tuple[Table, Columns]
     Raises:
         SessionError: If a column does not belong to a session.
     """
+    from orthocal.io.tables.table import read_table
+    from orthocal.measurement.importing.headings import EXPECTED, choose_columns, find_header
+
     try:
         table = read_table(path, content, find_header, expected=EXPECTED)
         columns = choose_columns(table.header, {}, where=f"{path}:{table.header_line}")
