@@ -57,6 +57,9 @@ MIN_DIAL_SCATTER = 1e-7
 SAME_POSTURE_RATIO = 2e-3
 """Ratio of a distance to the largest one below which two postures differ by a wrong unit."""
 
+HALF_OF_SQUARES = 0.5**0.5
+"""Share of the norm of the deviations from which a single reading dominates them."""
+
 MANY_POSTURES = 500
 """Number of postures above which a tree finds the nearest neighbours."""
 
@@ -201,18 +204,25 @@ def _by_model(
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:
     """Finding about postures in which the nominal machine would have moved the gauge far more.
 
-    Prescribed readings, such as those of a probe, do not show how far the gauge moved.
+    Prescribed readings, such as those of a probe, do not show how far the gauge moved. If the
+    others agree with the machine, one reading is wrong, such as one of another setup.
     """
     if any(states_readings(s.sensor) for s in session.setups.values()):
         return None
     observations = problem.observations
     values = problem.values * problem.noise_ratio
-    measured, deviation = (
-        _rms(observations.rows(project_out_zeros(v, observations)))
-        for v in (values, values - problem.predict(problem.active_theta) * problem.noise_ratio)
+    expected = problem.predict(problem.active_theta) * problem.noise_ratio
+    readings, deviations = (
+        observations.rows(project_out_zeros(v, observations)) for v in (values, values - expected)
     )
+    measured, deviation = _rms(readings), _rms(deviations)
     if deviation < MIN_WRONG_MACHINE or deviation < WRONG_MACHINE_RATIO * measured:
         return None
+    worst = int(np.argmax(np.abs(deviations)))
+    others = [r for i, r in enumerate(session.readings) if i != worst]
+    if np.abs(deviations[worst]) > HALF_OF_SQUARES * np.linalg.norm(deviations) and others:
+        rest = session.select(others)
+        return _dimensions(rest, build_problem(rest, model="offsets"))
     return words.wrong_dimensions(describe_legs(session.robot), deviation, measured)
 
 

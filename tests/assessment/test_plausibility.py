@@ -117,6 +117,20 @@ def test_postures_of_a_machine_of_other_dimensions_are_found(tmp_path, plan, ses
     assert found.verdict == "reject"
 
 
+def test_a_line_with_the_name_of_another_setup_is_not_another_machine():
+    """A leg swings by tens of millimetres where its indicator does not follow it."""
+    session = session_of("workshop")
+    readings = [
+        replace(r, setup="xz") if (r.setup, r.posture) == ("zx", "x_max") else r
+        for r in session.readings
+    ]
+    found = judge_session(replace(session, readings=tuple(readings)))
+    assert found.verdict == "review"
+    finding = found.findings[0]
+    assert [(p.setup, p.posture) for p in finding.places] == [("xz", "x_max")]
+    assert "may name another setup or posture" in finding.text
+
+
 def test_legs_of_different_lengths_are_found(tmp_path):
     folder = tmp_path / "machine"
     write_orthoglide(folder, 0.31025)

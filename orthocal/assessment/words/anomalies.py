@@ -84,12 +84,23 @@ def _looks_as_if(session: Session, anomaly: Anomaly, descriptions: Sequence[str]
             f"it reads {signed(value / MM)} mm; the other readings predict "
             f"{signed(anomaly.expected / MM)} mm."
         )
+        if not _is_in_range(session, e.rows[0], anomaly.expected):
+            predicted += (
+                " The gauge cannot show this: the line may name another setup or posture than the "
+                "one that was read."
+            )
     listed = ";\n  ".join(descriptions)
     sentences = [predicted, f"one of these may have happened:\n  {listed}."]
     if len(descriptions) == 1:
         sentences = [f"it looks as if {listed}.", predicted]
     first, *others = [s for s in sentences if s]
     return " ".join(map(capitalised, [f"{_lines(session, e)}{first}", *others]))
+
+
+def _is_in_range(session: Session, row: int, value: float) -> bool:
+    """True if the gauge of a row can show a value, in [m], wherever its zero is set."""
+    limits = session.gauges[session.setups[session.readings[row].setup].gauge].range
+    return limits is None or abs(value) <= limits[1] - limits[0]
 
 
 def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
