@@ -76,9 +76,10 @@ STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "r
 LONGEST_LINE = 150
 """Characters of a line with names from files, in the short answer."""
 
-NEW_NOTE = (
-    "new: complete offset, in place of now. `orthocal export --offsets` converts it to HOME_OFFSET."
-)
+CONVERTED = "`orthocal export --offsets` converts it to HOME_OFFSET."
+"""How an offset becomes a value of the controller."""
+
+NEW_NOTE = f"new: complete offset, in place of now. {CONVERTED}"
 """Meaning of the column `new` of offsets."""
 
 PRINT = "print. After a crash or a change of the printer probe again."

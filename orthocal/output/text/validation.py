@@ -12,6 +12,7 @@ from orthocal.assessment.validation import Validation
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
+    CONVERTED,
     PRINT,
     calibrate_command,
     describe_columns,
@@ -25,6 +26,7 @@ from orthocal.output.text.answer import (
 from orthocal.output.text.layout import (
     bullets,
     mm,
+    noted,
     residual_table,
     section,
     signed,
@@ -72,7 +74,9 @@ def render_validation(
     ]
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
-        parts.append(section("Values to enter", table_of(("drive", "new", "unit"), rows)))
+        table = table_of(("drive", "new", "unit"), rows)
+        note = f"new: complete offset. {CONVERTED}"
+        parts.append(section("Values to enter", noted(table, note)))
     further = bool(judged.of_kind("further change"))
     backlash = judged.backlash
     if validation.confirmed and assessment_of(answer).entries and (further or complete):
