@@ -28,6 +28,7 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.planning import tool_candidates
+from orthocal.planning.equipment import USUAL_BALL
 from orthocal.session.session import Purpose
 
 SIZES = {
@@ -235,6 +236,18 @@ def planned(tmp_path_factory, short_reports, quick_plans):
     mill = tmp_path_factory.mktemp("planned") / "mill"
     words = options(workspace_mm="40", tolerance="*.offset_mm=4", hours="0.25")
     return mill, orthocal("new", mill, *words)
+
+
+def test_a_gauge_without_a_tip_has_the_usual_ball(tmp_path):
+    """The line between two rods, which the gauge would read without a tip, is empty space."""
+    dial, folder = tmp_path / "dial.yaml", tmp_path / "mill"
+    dial.write_text("sigma_mm: 0.0005\nresolution_mm: 0.001\nrange_mm: [-6, 6]\n")
+    code, _, err = orthocal("new", folder, *options(), "--paper", "--gauge", dial)
+    assert code == 0
+    assert f"Gauge: ball of 3 mm diameter (not stated in {dial})." in err
+    session = load_plan(folder / "first")
+    assert {(s.sensor.rod, s.sensor.tip) for s in session.setups.values()} == {("a", USUAL_BALL)}
+    assert session.gauge.range == (-6e-3, 6e-3)
 
 
 def test_without_paper_a_plan_is_chosen(planned):

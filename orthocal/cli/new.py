@@ -207,6 +207,8 @@ def new(
     design = _design(name, dimensions, options, controller)
     _write(folder, name, design)
     _report(folder, design)
+    if design.assumed_tip:
+        put_note(design.assumed_tip)
     if not design.tolerance_stated:
         put_note(
             f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "
@@ -226,6 +228,8 @@ class _Design:
     plan: orthocal.MeasuringPlan | FixedPlan | None
     """Plan; None for the paper's readings."""
     session: orthocal.Session
+    assumed_tip: str
+    """Note about a tip that the file of the gauge does not state."""
     files: dict[str, str]
     """Text of the files beside session.yaml and readings.csv, by name."""
 
@@ -242,6 +246,7 @@ def _design(
         OrthocalError: If an option or answer is invalid, or there is no suitable plan.
     """
     from orthocal.cli.dialogue import ask_tolerance, find_answers
+    from orthocal.output.text.plan import describe_assumed_tip
     from orthocal.planning.equipment import load_dial
     from orthocal.planning.owned_sensors import load_owned_sensor
 
@@ -278,6 +283,7 @@ def _design(
             tolerance_stated=tolerance is not None,
             plan=plan,
             session=session,
+            assumed_tip=describe_assumed_tip(equipment, session),
             files=_draw(plan, session),
         )
 

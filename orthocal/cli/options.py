@@ -209,8 +209,8 @@ Gauge = Annotated[
     Path | None,
     Option(
         metavar="FILE",
-        help="dial.yaml with range, resolution and tip of the gauge; default: ±5 mm, 10 µm, ball "
-        "of 3 mm diameter.",
+        help="dial.yaml with range, resolution and tip of the gauge; default tip: ball of 3 mm "
+        "diameter; default gauge: ±5 mm, 10 µm, this ball.",
     ),
 ]
 Owned = Annotated[

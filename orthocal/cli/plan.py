@@ -113,7 +113,7 @@ def plan(
     Args:
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
     """
-    from orthocal.output.text.plan import plan_json
+    from orthocal.output.text.plan import describe_assumed_tip, plan_json
     from orthocal.output.text.summary import print_summary
     from orthocal.planning.expected_error import CRITERIA
     from orthocal.runtime.worker_pool import available_cores, worker_budget
@@ -128,11 +128,8 @@ def plan(
     workers = options.workers or available_cores()
     chosen = _choose(subject, options, controller, workers=workers)
     deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
-    if options.gauge is not None and chosen.equipment.tip is None:
-        put_note(
-            f"orthocal: {options.gauge} states no tip: the plan is for the line between the rods, "
-            "which no dial touches; for a ball add tip: {ball: {radius_mm: 1.5}}"
-        )
+    if assumed := describe_assumed_tip(chosen.equipment, chosen.session):
+        put_note(assumed)
     if out is not None:
         with worker_budget(workers):
             _write(chosen, out)

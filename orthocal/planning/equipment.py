@@ -72,6 +72,8 @@ class Equipment:
     gauge: Gauge = USUAL_DIAL
     tip: Tip | None = USUAL_BALL
     """Tip of the gauge; None for readings of a leg's centre line, as in the paper."""
+    without_tip: Path | None = None
+    """File of the gauge if it states no tip, so that `tip` is assumed."""
     mounting: Mounting = USUAL
     """Mounting uncertainty of the gauge."""
     rods: tuple[str, ...] = ()
@@ -282,8 +284,8 @@ def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
     Args:
         path: YAML with `sigma_mm`, `resolution_mm`, `range_mm`, `tip` and `scale_tolerance` as
             under `gauge` in a session.yaml, and `direction_tolerance_mrad`, `section_tolerance_mm`
-            and `lateral_tolerance_mm` as in its setups. Without `tip` the gauge reads the centre
-            line of a leg.
+            and `lateral_tolerance_mm` as in its setups. Without `tip` the gauge has the tip of
+            the other equipment.
         equipment: The other equipment.
 
     Raises:
@@ -309,7 +311,8 @@ def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
     return replace(
         equipment,
         gauge=gauge.to_gauge(),
-        tip=None if gauge.tip is None else Tip.from_keys(gauge.tip),
+        tip=equipment.tip if gauge.tip is None else Tip.from_keys(gauge.tip),
+        without_tip=file if gauge.tip is None else None,
         mounting=mounting,
     )
 

@@ -19,7 +19,7 @@ from processes import children_of, is_running, until
 
 from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
 from orthocal.planning.candidates import list_candidates, measure_candidates
-from orthocal.planning.equipment import Equipment
+from orthocal.planning.equipment import USUAL_BALL, Equipment
 from orthocal.planning.expected_error import CRITERIA
 from orthocal.planning.selection import SetupSearch
 from orthocal.runtime import worker_pool
@@ -134,12 +134,17 @@ def test_an_interrupted_plan_ends_its_worker_processes(tmp_path):
     assert not out.exists()
 
 
-def test_a_dial_without_a_tip_is_named(tmp_path):
-    dial = tmp_path / "dial.yaml"
+def test_a_dial_without_a_tip_has_the_usual_ball(tmp_path):
+    """A dial of the packaged sessions without a tip reads the centre line, as in the paper."""
+    dial, out = tmp_path / "dial.yaml", tmp_path / "out"
     dial.write_text("sigma_mm: 0.005\nrange_mm: [-5, 5]\n")
-    code, _, err = run_orthocal(".", "plan", "orthoglide", *QUICK, "--gauge", dial)
+    words = ["plan", "orthoglide", *QUICK, "--gauge", dial, "--out", out]
+    code, _, err = run_orthocal(".", *words)
     assert code == 0
-    assert f"orthocal: {dial} states no tip: the plan is for the line between the rods" in err
+    assert f"Gauge: ball of 3 mm diameter (not stated in {dial}). State another tip" in err
+    assert {s.sensor.tip for s in load_plan(out).setups.values()} == {USUAL_BALL}
+    dial.write_text(DIAL)
+    assert "not stated" not in run_orthocal(".", *words, "--force")[2]
 
 
 def test_offsets_that_too_few_readings_do_not_determine_are_named():

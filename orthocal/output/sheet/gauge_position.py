@@ -11,6 +11,7 @@ from orthocal.arrays import Array
 from orthocal.measurement.motion.motion import Guidance, SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.protocol import Contact, TouchingTip
+from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, Setup
 from orthocal.units import MM
 from orthocal.viewer.motion import place_frames
@@ -187,11 +188,11 @@ def _find_touched(robot: Robot, setup: Setup) -> tuple[Leg | None, Rod | None]:
     return (robot.legs.get(name) if kind == "leg" else None), None
 
 
-def name_tip(tip: TouchingTip | None) -> str:
+def name_tip(tip: Tip | TouchingTip | None) -> str:
     """Kind and dimensions of a tip."""
     if tip is None:
         return "tip"
-    if tip.edge is None:
+    if tip.width == 0.0:
         return f"ball of {2.0 * tip.radius / MM:g} mm diameter"
     if tip.radius > 0.0:
         return f"pin of {2.0 * tip.radius / MM:g} mm diameter, {tip.width / MM:g} mm wide"

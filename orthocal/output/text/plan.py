@@ -18,6 +18,7 @@ from orthocal.io.documents import format_json
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.measurement.motion.approach import approach_length, describe_approach
+from orthocal.output.sheet.gauge_position import name_tip
 from orthocal.output.text.accuracy import (
     NOTICEABLE,
     describe_gains,
@@ -26,6 +27,7 @@ from orthocal.output.text.accuracy import (
 )
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN, Stage
+from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.first_plan import FixedPlan
 from orthocal.planning.further_readings import FurtherReadings
@@ -121,6 +123,18 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         section("How to measure", bullets(_how_to_measure(plan))),
     ]
     return Group(*parts)
+
+
+def describe_assumed_tip(equipment: Equipment, session: Session) -> str:
+    """Note that the tip of a gauge is assumed; "" if the plan does not depend on it."""
+    sensors = [setup.sensor for setup in session.setups.values()]
+    touches = any(isinstance(s, LegIndicator) and s.tip == equipment.tip for s in sensors)
+    if equipment.tip is None or equipment.without_tip is None or not touches:
+        return ""
+    return (
+        f"Gauge: {name_tip(equipment.tip)} (not stated in {equipment.without_tip}). State another "
+        "tip there, such as tip: {blade: {width_mm: 20}}, and plan again."
+    )
 
 
 def describe_size(session: Session) -> str:
