@@ -10,6 +10,7 @@ import shutil
 
 import numpy as np
 import pytest
+import yaml
 from commands import orthocal
 from conftest import marked_reports
 from typer.main import get_command
@@ -362,6 +363,24 @@ def test_simulated_session_gives_the_true_errors(root, tmp_path):
     code, _, err = orthocal(*words, "--error", "x_slide.offset_mm=1")
     assert code == 2
     assert "exists already; --force overwrites it" in err
+
+
+def test_drawn_errors_of_gauges_are_printed(root, tmp_path):
+    """They are new if the file states no errors of these gauges, and kept if it does."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    plan, machine = root / "examples/raw-cycles", root / "examples/raw-cycles/machine.yaml"
+    code, _, err = orthocal("simulate", plan, "--errors", machine, "--out", one)
+    assert code == 0
+    truth = yaml.safe_load((one / "truth.yaml").read_text())["sensors"]
+    scale = f"gauge.scale_ppm {truth['gauge.scale_ppm']:.4g}"
+    words = f"Drawn, because {machine} does not state these errors of gauges: {scale}. To simulate"
+    assert f"{words} the same gauges again: --errors {one}/truth.yaml" in " ".join(err.split())
+    again = ("simulate", plan, "--errors", one / "truth.yaml", "--seed", "2", "--out", two)
+    code, _, err = orthocal(*again)
+    assert (code, "Drawn" in err) == (0, False)
+    kept = yaml.safe_load((two / "truth.yaml").read_text())["sensors"]
+    assert kept["gauge.scale_ppm"] == truth["gauge.scale_ppm"]
+    assert kept["setup.yx.roll_mrad"] != truth["setup.yx.roll_mrad"]
 
 
 def test_simulated_errors_depend_on_the_seed(root, tmp_path):

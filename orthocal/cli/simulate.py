@@ -42,8 +42,9 @@ def simulate(
 
     The directory receives session.yaml, readings.csv and truth.yaml. Readings state the conditions
     that effects of the machine need, and their time and temperature with --temperature. With the
-    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew. If
-    the sessions state different mechanical adjustments (adjusted_mm), the machine is adjusted.
+    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew.
+    Errors of other gauges are drawn and printed. If the sessions state different mechanical
+    adjustments (adjusted_mm), the machine is adjusted.
 
     Args:
         draw (MODEL|PATTERNS): Draw random errors by their tolerances: those of a model, or by name
@@ -53,7 +54,12 @@ def simulate(
         exact: Without noise, gauge zeros and rounding.
     """
     from orthocal.observation.sensor_groups import nuisance_parameters
-    from orthocal.observation.simulate import collect_errors, truth_document
+    from orthocal.observation.simulate import (
+        collect_errors,
+        drawn_gauge_errors,
+        truth_document,
+    )
+    from orthocal.output.text.answer import quote_path
     from orthocal.robot.parameters import errors_at
 
     require_new_session(out, FILES, force=force)
@@ -77,3 +83,10 @@ def simulate(
     comment = "Simulated readings, not measured. The true errors are in truth.yaml."
     path = orthocal.write_session(simulated.session, out, comment=comment, extra=truth)
     put_note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
+    drawn = drawn_gauge_errors(simulated, true_errors) if errors is not None else {}
+    if drawn:
+        values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
+        put_note(
+            f"Drawn, because {errors} does not state these errors of gauges: {values}. To simulate "
+            f"the same gauges again: --errors {quote_path(out / 'truth.yaml')}"
+        )

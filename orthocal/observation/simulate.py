@@ -379,22 +379,36 @@ def read_errors(
     return errors
 
 
+def quantity(parameter: Parameter, value: float) -> tuple[str, float]:
+    """Key of a truth.yaml with the unit of a parameter, and its value [SI] in this unit."""
+    key = f"{parameter.name}_{parameter.edge_unit}"
+    return key, float(f"{value * parameter.edge_factor:.9g}")
+
+
+def drawn_gauge_errors(simulated: SimulatedSession, stated: Iterable[str]) -> dict[str, float]:
+    """Errors of the gauges that were drawn, by their keys in truth.yaml.
+
+    Args:
+        simulated: The simulated session.
+        stated: Names of the parameters whose values were stated.
+    """
+    drawn, stated = simulated.nuisance, set(stated)
+    parameters = nuisance_parameters(simulated.session).parameters
+    gauges = (p for p in parameters if p.name.startswith(OF_GAUGE) and p.name not in stated)
+    return dict(quantity(p, drawn[p.name]) for p in gauges if drawn[p.name])
+
+
 def truth_document(simulated: SimulatedSession) -> str:
     """Text of truth.yaml: errors, gauge zeros and nuisance parameters of a simulated session."""
     parameters = simulated.session.robot.parameters
-    errors = {}
-    for name, value in simulated.errors.items():
-        p = parameters[name]
-        errors[f"{name}_{p.edge_unit}"] = float(f"{value * p.edge_factor:.9g}")
-    document = {"errors": errors}
+    errors = simulated.errors
+    document = {"errors": dict(quantity(parameters[n], v) for n, v in errors.items())}
     if adjusted := simulated.session.adjusted:
         document["adjusted_mm"] = {name: to_mm(amount) for name, amount in adjusted.items()}
     document["zeros_mm"] = {name: to_mm(value) for name, value in simulated.zeros.items()}
     if simulated.nuisance:
         by_name = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
-        document["sensors"] = {
-            f"{name}_{by_name[name].edge_unit}": float(f"{value * by_name[name].edge_factor:.9g}")
-            for name, value in simulated.nuisance.items()
-        }
+        nuisance = simulated.nuisance
+        document["sensors"] = dict(quantity(by_name[n], v) for n, v in nuisance.items())
     head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"
     return head + str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))
