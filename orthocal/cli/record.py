@@ -20,8 +20,9 @@ def record(session: Path) -> None:
     From a pipe each line counts as typed. Warnings are those of `check` for the readings so far.
 
     Args:
-        session (SESSION): session.yaml of a plan, with an empty readings.csv or none, or the
-            directory that contains it.
+        session (SESSION): session.yaml of a plan, or the directory that contains it. Its
+            readings.csv has a line for each reading, which may be empty; a session.yaml without
+            the key `readings` gets one.
     """
     from orthocal.cli.recording import Dialogue
     from orthocal.measurement.recording import open_recording

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import orthocal
 from orthocal.cli.files import state_conditions
 from orthocal.cli.options import (
@@ -54,12 +57,7 @@ def simulate(
         exact: Without noise, gauge zeros and rounding.
     """
     from orthocal.observation.sensor_groups import nuisance_parameters
-    from orthocal.observation.simulate import (
-        collect_errors,
-        drawn_gauge_errors,
-        truth_document,
-    )
-    from orthocal.output.text.answer import quote_path
+    from orthocal.observation.simulate import collect_errors, drawn_gauge_errors, truth_document
     from orthocal.robot.parameters import errors_at
 
     require_new_session(out, FILES, force=force)
@@ -83,7 +81,14 @@ def simulate(
     comment = "Simulated readings, not measured. The true errors are in truth.yaml."
     path = orthocal.write_session(simulated.session, out, comment=comment, extra=truth)
     put_note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
-    drawn = drawn_gauge_errors(simulated, true_errors) if errors is not None else {}
+    if errors is not None:
+        _report_drawn(drawn_gauge_errors(simulated, true_errors), errors, out)
+
+
+def _report_drawn(drawn: Mapping[str, float], errors: Path, out: Path) -> None:
+    """Print the errors of gauges that a file of errors does not state."""
+    from orthocal.output.text.answer import quote_path
+
     if drawn:
         values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
         put_note(

@@ -67,6 +67,12 @@ MAX_LISTED = 3
 OTHER_SUFFIXES = (".csv", ".json", ".urdf")
 """Suffixes of files that are not a session.yaml."""
 
+EXPECTED_ROWS = (
+    "expected a header such as setup,posture,cycle,reading_mm and a line for each reading, as on "
+    "the sheet. To write the lines of a plan again, repeat its command with --force"
+)
+"""Expected content of a readings.csv without rows."""
+
 
 def load_session(path: str | Path, *, partial: bool = False) -> Session:
     """Read a session: its YAML, its CSV and its robot, checked against each other.
@@ -90,9 +96,11 @@ def _load_session(
 ) -> Session:
     """Session with readings, stations not located; readings of empty cells are NaN."""
     plan, readings_path = _build_unread(file, keys)
-    table = read_file(readings_path, error=SessionError)
+    table = _read_table(readings_path)
     with content_withheld_outside(file.parent, readings_path):
-        rows = read_rows(readings_path, table)
+        rows = tuple(read_rows(readings_path, table))
+        if not rows:
+            raise SessionError(f"holds no readings; {EXPECTED_ROWS}", where=str(readings_path))
         readings, points = check_readings(rows, plan, file=readings_path, wrong=wrong)
     session = replace(
         plan,
@@ -104,6 +112,21 @@ def _load_session(
     )
     check_contacts(session)
     return session
+
+
+def _read_table(path: Path) -> bytes:
+    """Content of a readings.csv.
+
+    Raises:
+        SessionError: If it is missing or empty; says how to write the rows of a plan again.
+    """
+    problem = "there is no such file"
+    if exists(path):
+        table = read_file(path, error=SessionError)
+        if table.strip():
+            return table
+        problem = "is empty"
+    raise SessionError(f"{problem}; {EXPECTED_ROWS}", where=str(path))
 
 
 def session_digest(keys: bytes, table: bytes, compensation: Compensation) -> str:
