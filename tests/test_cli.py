@@ -582,3 +582,33 @@ def test_export_refuses_a_module_beside_offsets(days, tmp_path):
     assert code == 2
     assert "joints.ini" in err
     assert not (tmp_path / "out/kinematics.ini").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--seed nine", "'--seed': found 'nine'; expected an integer"),
+        ("--seed -1", "'--seed': found '-1'; expected at least 0"),
+        ("--across-mm far", "'--across-mm': found 'far'; expected a number"),
+        ("--along 99", "'--along': found '99'; expected at most 50"),
+    ],
+)
+def test_wrong_numbers_of_options_are_shown(words, message):
+    code, out, err = orthocal("plan", "orthoglide", *words.split())
+    assert (code, out) == (2, "")
+    assert f"Invalid value for {message}\n" in err
+
+
+def test_exchanged_arguments_of_import_are_named(root, tmp_path):
+    table, session = tmp_path / "t.csv", tmp_path / "session"
+    table.write_text("setup;posture;reading_mm\n")
+    shutil.copytree(root / "examples/raw-cycles", session)
+    code, _, err = orthocal("import", session, table)
+    assert code == 2
+    assert err == (
+        f"orthocal: {table}: is no session; expected first the table, then the session: "
+        f"orthocal import {table} {session}\n"
+    )
+    code, _, err = orthocal("import", table, tmp_path / "none")
+    assert code == 2
+    assert "Expected a table and a session.yaml or its directory, or a log and a new" in err

@@ -114,15 +114,24 @@ def _require_session(table: Path, session: Path) -> None:
     """Refuse a file that is missing, and a table without a session to import it into.
 
     Raises:
-        SessionError: Naming what is missing.
+        SessionError: Naming what is missing, or the order of exchanged arguments.
     """
+    from orthocal.output.text.answer import quote_path
+
     if exists(_session_file(session)):
         return
     if not exists(table):
         raise orthocal.SessionError("there is no such file", where=str(table))
+    if exists(_session_file(table)):
+        raise orthocal.SessionError(
+            "is no session; expected first the table, then the session: "
+            f"orthocal import {quote_path(session)} {quote_path(table)}",
+            where=str(session),
+        )
     raise orthocal.SessionError(
         f"there is no session to import into, and {table} is not recognised as a printer's log; "
-        "--format names its firmware",
+        "--format names its firmware. Expected a table and a session.yaml or its directory, or a "
+        "log and a new directory",
         where=str(session),
     )
 

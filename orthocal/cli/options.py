@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 
 import orthocal
 from orthocal.errors import ParameterError
+from orthocal.text import shorten
 from orthocal.units import MM
 
 if TYPE_CHECKING:
@@ -35,8 +36,30 @@ LONGEST_LINE = 100
 """Number of characters of a line of help; longer lines are wrapped, not cut off."""
 
 
+_EXPECTED = {
+    "int_parsing": "an integer",
+    "float_parsing": "a number",
+    "greater_than_equal": "at least {ge}",
+    "less_than_equal": "at most {le}",
+}
+"""Kind of an error about the value of an option, mapped to the expected value."""
+
+
 class PanelGroup(TyperGroup):
-    """Group whose help lists the commands panel by panel."""
+    """Group whose help lists the commands panel by panel, and whose errors show what was found."""
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - Click's types
+        """Run a command; an error about an option states value and expectation."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as e:
+            from pydantic import ValidationError
+
+            errors = e.__cause__.errors() if isinstance(e.__cause__, ValidationError) else []
+            for error in errors[:1]:
+                expected = _EXPECTED.get(error["type"], error["msg"]).format(**error.get("ctx", {}))
+                e.message = f"found '{shorten(str(error['input']))}'; expected {expected}"
+            raise
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - Click's types
         """Write one section for each panel."""

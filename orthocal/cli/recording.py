@@ -18,7 +18,8 @@ from orthocal.errors import OrthocalError, SessionError
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.hypotheses.search import find_suspected_rows
 from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading, plain_minus
-from orthocal.measurement.files.readings_checks import parse_temperature, require_approach
+from orthocal.kinematics.conditions import APPROACH, find_approach_problem
+from orthocal.measurement.files.readings_checks import parse_temperature
 from orthocal.measurement.recording import Recording
 from orthocal.observation.conditions import needed_conditions
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
@@ -95,8 +96,9 @@ class RecordedConditions:
             SessionError: If the letters are wrong.
         """
         robot = self._recording.session.robot
-        letters = text * len(robot.drives) if len(text) == 1 else text
-        require_approach(letters, robot, "the side")
+        letters = text * len(robot.drives) if text in APPROACH else text
+        if problem := find_approach_problem(letters, robot):
+            raise SessionError(f"the side is {problem}; or one of these letters for all drives")
         self.approach = letters
 
     def of(self, row: Reading) -> Conditions | None:

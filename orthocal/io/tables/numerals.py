@@ -58,6 +58,7 @@ _PATTERNS: dict[Sign, re.Pattern[str]] = {
 
 _TYPED = re.compile(r"([-+]?) ?([0-9]+[.,]?[0-9]*|[.,][0-9]+)")
 _TYPED_UNIT = re.compile(r"(.*?)\s*(mm|µm|μm|um|m|in|inch|\"|'|″)", re.I)
+_UNIT_NAMES = dict.fromkeys(("in", "inch", '"', "″"), "inches") | {"'": "feet"}
 _SEVERAL_SEPARATORS = re.compile(r"[-+]? ?[0-9]+([.,' ][0-9]+){2,}|[-+]? ?[0-9]+[' ][0-9.,]+")
 _THOUSANDS = re.compile(r"[1-9][0-9]{0,2},[0-9]{3}")
 
@@ -171,7 +172,8 @@ def parse_typed_reading(text: str, *, largest: float = math.inf) -> float:
     if unit is not None:
         plain = unit[1]
         if unit[2].lower() != "mm":
-            raise SessionError(f"'{shown}' is in {unit[2]}; readings are in mm")
+            name = _UNIT_NAMES.get(unit[2].lower(), unit[2])
+            raise SessionError(f"'{shown}' is in {name}; readings are in mm")
     number = _TYPED.fullmatch(plain) if len(plain) <= LONGEST_NUMBER else None
     if number is None:
         if _SEVERAL_SEPARATORS.fullmatch(plain):
