@@ -467,7 +467,12 @@ def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.accuracy import describe_gains
     from orthocal.output.text.layout import counted
-    from orthocal.output.text.plan import describe_expected, describe_size, show_duration
+    from orthocal.output.text.plan import (
+        describe_expected,
+        describe_size,
+        describe_unusable,
+        show_duration,
+    )
 
     plan, size = design.plan, describe_size(design.session)
     lines = [f"Plan: {size}."]
@@ -478,6 +483,8 @@ def _report(folder: Path, design: _Design) -> None:
         ]
     if plan is not None and not isinstance(plan, orthocal.MeasuringPlan):
         lines += [BED_WORDS, *describe_gains(plan.find_sensor_gains(), plan.expected.reported.rms)]
+    if isinstance(plan, orthocal.MeasuringPlan):
+        lines += describe_unusable(plan)
     programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
         f"Wrote {folder}: {design.machine.words}.",

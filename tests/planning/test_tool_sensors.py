@@ -38,7 +38,7 @@ from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
-from orthocal.output.text.plan import plan_json
+from orthocal.output.text.plan import describe_unusable, plan_json
 from orthocal.planning import tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
@@ -390,7 +390,17 @@ def test_a_sensor_with_too_short_a_range_is_named(owned):
         plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
     assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
     assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
-    assert "Not in the plan: bar." in summarize(plan)
+    title, *_, last = summarize(plan).split("\n\n")
+    assert title.endswith("min, without bar")
+    remedy = (
+        "To plan with it, state smaller tolerances (centre_tolerance_mm and length_tolerance_mm)"
+    )
+    entering = "or enter offsets of other readings first and plan from their session."
+    assert " ".join(last.split()).startswith("Not in the plan: bar. Within the tolerances")
+    assert " ".join(last.split()).endswith(f"{remedy}, use a gauge of more range {entering}")
+    active = plan.session.with_controller([1e-3, 0.0, 0.0])  # offsets are entered already
+    (words,) = describe_unusable(replace(plan, complements=True, session=active))
+    assert words.endswith(f"{remedy} or use a gauge of more range.")
 
 
 @pytest.mark.parametrize("names", [("dial",), ("bar", "bar")])

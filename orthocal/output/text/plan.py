@@ -72,6 +72,9 @@ EVENLY = "evenly spaced"
 KNOWN_ZERO = {BallBar.kind: "the ball bar", Probe.kind: "the probe"}
 """Sensors whose zero is known, with their nouns."""
 
+PLACE_TOLERANCES = {BallBar.kind: ("centre_tolerance_mm", "length_tolerance_mm")}
+"""Keys of sensors with a known zero for the tolerances that their range must hold."""
+
 HOW_TO = {
     LegIndicator.kind: (
         "Dial at a leg: mount it so that it touches at the stated part of the length from the "
@@ -105,22 +108,23 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     remaining = describe_remaining(plan.find_remaining()) if details else []
     gains = plan.find_sensor_gains()
     helps = _helps(plan, gains)
+    absent = f", without {joined(_unusable_names(plan))}" if plan.unusable else ""
     parts: list[RenderableType] = [
         Text(
             f"Plan for {robot.name}, model {plan.forecast.selection.label}: {describe_size(s)}, "
-            f"about {show_duration(plan.minutes)}",
+            f"about {show_duration(plan.minutes)}{absent}",
             style="bold",
         ),
         Text(),
         *map(Text, describe_expected(plan)),
         *map(Text, _undetermined(plan, gains)),
-        *map(Text, _unusable(plan)),
         Text(_when_enough(plan)),
         section("Other plans in the same time", _alternatives(plan)),
         *([section("What would help", bullets(helps))] if helps else []),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(_how_to_measure(plan))),
+        *([Text(), *map(Text, describe_unusable(plan))] if plan.unusable else []),
     ]
     return Group(*parts)
 
@@ -177,14 +181,28 @@ def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) 
     return [describe_remedy(offsets, gains, plan.expected.reported.rms)]
 
 
-def _unusable(plan: MeasuringPlan) -> list[str]:
-    """Gauges whose range is too small for their readings, as sentences."""
-    return [
-        f"Not in the plan: {name or DIAL}. Within the tolerances of machine, place and gauge its "
-        f"readings reach ±{needed / MM:.1f} mm, beyond its range. State smaller tolerances, use a "
-        "gauge of more range, or enter offsets of other readings first and plan from their session."
-        for name, needed in plan.unusable.items()
-    ]
+def describe_unusable(plan: MeasuringPlan) -> list[str]:
+    """Gauges whose range is too small for their readings, and what to do, as sentences."""
+    entered = plan.complements and bool(np.any(plan.session.active_offsets))
+    kinds = {sensor.name: sensor.keys["sensor"] for sensor in plan.equipment.owned}
+    sentences = []
+    for name, needed in zip(_unusable_names(plan), plan.unusable.values(), strict=True):
+        keys = PLACE_TOLERANCES.get(kinds.get(name, ""), ())
+        tolerances = f"tolerances ({joined(keys)})" if keys else "tolerances"
+        remedies = [f"state smaller {tolerances}", "use a gauge of more range"]
+        if not entered:
+            remedies.append("enter offsets of other readings first and plan from their session")
+        sentences.append(
+            f"Not in the plan: {name}. Within the tolerances of machine, place and gauge its "
+            f"readings reach ±{needed / MM:.1f} mm, beyond its range. To plan with it, "
+            f"{joined(remedies, 'or')}."
+        )
+    return sentences
+
+
+def _unusable_names(plan: MeasuringPlan) -> list[str]:
+    """Names of the gauges whose range is too small for their readings."""
+    return [name or DIAL for name in plan.unusable]
 
 
 def _undetermined_offsets(plan: MeasuringPlan | FixedPlan) -> list[str]:
