@@ -17,7 +17,10 @@ def record(session: Path) -> None:
 
     The position of stand and machine is printed for each reading. Every reading is on disk before
     the next one is asked for. An interrupted recording continues at the first missing reading.
-    From a pipe each line counts as typed. Warnings are those of `check` for the readings so far.
+    From a pipe each line counts as typed.
+
+    A reading far from the one that the others predict is marked at once; about one correct reading
+    in 400 is. The other warnings are those of `check` for the readings so far.
 
     Args:
         session (SESSION): session.yaml of a plan, or the directory that contains it. Its

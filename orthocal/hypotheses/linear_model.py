@@ -46,6 +46,9 @@ LARGEST_ERROR = 6.0
 MAX_LINEARISED_ENTRIES = 1600
 """Most entries of all points that are linearised at once, to limit the memory."""
 
+MAX_HALVINGS = 4
+"""Largest number of halvings of a step to a machine without all readings."""
+
 MAX_STEPS = 8
 """Most Gauss-Newton steps to the most likely machine."""
 
@@ -461,8 +464,8 @@ class LinearModel:
         """Linearise about the most likely machine, with a further effect of unknown amount.
 
         Gauss-Newton steps are needed because readings are not linear over offsets of some mm. They
-        end when no error changes by more than CONVERGED_CHANGE, or before the first machine that
-        cannot reach a posture.
+        end when no error changes by more than CONVERGED_CHANGE. A step to a machine that cannot
+        reach a posture, or whose rod the tip misses, is halved.
 
         Args:
             entries: Readings, zeros projected out, shape (n_entries,), [m].
@@ -475,11 +478,28 @@ class LinearModel:
             errors = about.errors_for(deviation - amount * effect)
             if not np.abs(errors - about.theta).max(initial=0.0) > CONVERGED_CHANGE:
                 break
-            try:
-                about = self.linearise(errors, (), about.passive, keep_jacobian=False)
-            except (ClosureError, SessionError, np.linalg.LinAlgError):
+            nearer = self._linearise_towards(errors, about)
+            if nearer is None:
                 break
+            about = nearer
         return about
+
+    def _linearise_towards(
+        self, errors: Array, about: ModelLinearisation
+    ) -> ModelLinearisation | None:
+        """Linearisation about errors, or about the first machine halfway to them that works.
+
+        None if no machine on the way has all readings.
+        """
+        step = errors - about.theta
+        for share in 0.5 ** np.arange(MAX_HALVINGS + 1):
+            try:
+                return self.linearise(
+                    about.theta + share * step, (), about.passive, keep_jacobian=False
+                )
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
+                continue
+        return None
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""

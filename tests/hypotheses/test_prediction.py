@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from calibrated import plan_of, session_of
 
-from orthocal import draw_errors, simulate_session
+from orthocal import draw_errors, load_plan, simulate_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.linear_model import CONVERGED_CHANGE, MAX_STEPS, LinearModel
@@ -17,6 +17,26 @@ from orthocal.hypotheses.search import find_anomalies
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.session.session import Reading
 from orthocal.units import MM
+
+NEAR_THE_EDGE = """robot: orthoglide
+gauge: {sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5], tip: {ball: {radius_mm: 1.5}}}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+  y_max: {tcp_mm: [0, 60, 0]}
+  y_min: {tcp_mm: [0, -100, 0]}
+  z_max: {tcp_mm: [0, 0, 60]}
+  z_min: {tcp_mm: [0, 0, -100]}
+controller: {offsets_mm: [0, 0, 0]}
+calibration: {tolerances: {"*.offset_mm": 4}}
+setups:
+  yx: {leg: x, direction: y, section: {fraction: 0.5}, touches: a, postures: [zero, x_max, x_min]}
+  zy: {leg: y, direction: z, section: {fraction: 0.5}, touches: a, postures: [zero, y_max, y_min]}
+  xz: {leg: z, direction: x, section: {fraction: 0.5}, touches: a, beside_mm: [0, 5, 0],
+    postures: [z_max, zero, z_min], aligned_at: z_max}
+"""
+"""Plan whose last reading is near the edge of the rod if the offset of y is large."""
 
 ZERO = 1.0
 """Standard deviation of a free gauge zero in the dense covariance, [m]: 10⁵ times the noise."""
@@ -180,3 +200,16 @@ def test_the_expected_value_of_an_outlier_is_its_prediction(raw_cycles):
     mean, _ = LinearModel(wrong).predict_row(values, 9)
     assert (anomaly.explanation.kind, anomaly.explanation.rows) == ("outlier", (9,))
     assert anomaly.expected == pytest.approx(mean, abs=1e-9)
+
+
+@pytest.mark.parametrize("offset", [4.3e-3, 4.5e-3, 4.7e-3])
+def test_a_correct_reading_near_the_edge_of_a_rod_is_not_contradicted(tmp_path, offset):
+    """The first step to the most likely machine is to one whose rod the tip misses.
+
+    The nominal machine predicts the reading to 0.1 mm, although it is wrong by more than 1 mm.
+    """
+    (tmp_path / "session.yaml").write_text(NEAR_THE_EDGE)
+    session = simulate_session(load_plan(tmp_path), {"y_slide.offset": offset}, seed=1).session
+    row = len(session.readings) - 1
+    mean, std = LinearModel(session).compare_row(session.values, row)
+    assert abs(session.values[row] - mean) < 2.0 * std

@@ -314,6 +314,8 @@ class RecordingText:
     def suspects(self, index: int, lines: Sequence[int]) -> str:
         """Advice for a row that contradicts the others without a finding.
 
+        About one correct reading in 400 deviates by more than three standard deviations.
+
         Args:
             index: Index of the row.
             lines: Lines of the most likely mistakes; too many of them are not listed.
@@ -322,9 +324,10 @@ class RecordingText:
         others = [n for n in lines if n != self._recording.rows[index].line]
         where = "the lines before"
         if 0 < len(others) <= MAX_SUSPECTS:
-            where = f"{spans(others, 'line')}: the mistake may be there"
+            where = spans(others, "line")
         noun = "point" if is_point else self.instrument(index)
-        return self.wrap(f"Check the {noun}, and {where}.", indent="  ")
+        advice = f"Check the {noun}, and {where}. About one correct reading in 400 is marked, too."
+        return self.wrap(advice, indent="  ")
 
     def warning(self, finding: Finding, *, last: int | None = None) -> str:
         """A finding about the readings so far, in the words of `check`.
