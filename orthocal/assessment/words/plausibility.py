@@ -21,7 +21,7 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
         "wrong dimensions",
         f"The postures do not belong to this machine: the robot with {legs} would have moved the "
         f"gauge by {nominal / MM:.1f} mm RMS, and it moved by {measured / MM:.1f} mm.",
-        "Check `robot` and the joint coordinates of the postures.",
+        "Check `robot`, the joint coordinates of the postures and the unit of the readings.",
         nominal_rms_mm=nominal / MM,
         measured_rms_mm=measured / MM,
     )
