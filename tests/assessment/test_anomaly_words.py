@@ -36,12 +36,17 @@ def test_every_kind_has_a_sentence(root, kind):
 
 
 def test_an_action_that_costs_no_reading_comes_first(root):
-    """Calibrate with an effect; reverse signs of setups."""
+    """Calibrate with an effect; reverse signs of setups; read one of many again for their unit."""
     session = load_session(root / "examples/raw-cycles")
     sign = Explanation("reversed sign", "reading", rows=(3,), factor=-1.0)
     setup, other = (
         Explanation("reversed sign", "setup", rows=(row,), setups=(name,), factor=-1.0)
         for row, name in zip((0, 9), session.setups, strict=False)
+    )
+    rows = tuple(range(len(session.readings)))
+    inches, point = (
+        Explanation(kind, "all", rows=rows, factor=factor)
+        for kind, factor in (("wrong unit", 25.4), ("decimal point", 10.0))
     )
     backlash = Explanation(
         "backlash",
@@ -56,6 +61,7 @@ def test_an_action_that_costs_no_reading_comes_first(root):
     for explanation, alternative, first in (
         (sign, backlash, "Calibrate with `--effects backlash`."),
         (sign, setup, "Read "),
+        (inches, point, "Take one of these readings again. "),
         (setup, other, "Look at the mounting of the gauge. If a minus sign was forgotten, reverse"),
     ):
         anomaly = Anomaly(explanation, 9.0, None, alternatives=(alternative,))

@@ -140,7 +140,7 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     explanations = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
     texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in explanations)
     listed = ";\n".join(texts)
-    action = _repeat(session, *explanations)
+    action = _choose_factor(explanations) or _repeat(session, *explanations)
     if all(e.kind == "reversed sign" and e.setups for e in explanations):  # nothing to read again
         action = _remedy(
             session,
@@ -579,12 +579,12 @@ def _other_offset(session: Session, e: Explanation) -> str:
     An offset that is too small by an amount has the effect of an offset error of this amount.
     """
     text = f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is not"
-    if e.amount is None:
+    setups = [i for i, label in enumerate(session.labels) if label in e.sessions]
+    if e.amount is None or not setups:
         return f"{text} the stated one"
-    setup = next(i for i, label in enumerate(session.labels) if label in e.sessions)
     drive = [d.name for d in session.robot.drives].index(e.drives[0])
     p = session.robot.parameters[e.parameters[0]]
-    stated = float((session.robot.drive_zero - session.zero_drives[setup])[drive])
+    stated = float((session.robot.drive_zero - session.zero_drives[setups[0]])[drive])
     uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
     found = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
     return f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}"
@@ -684,6 +684,18 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     return (
         f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}. "
         f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
+    )
+
+
+def _choose_factor(explanations: Sequence[Explanation]) -> str:
+    """Action if only the unit of several readings is in question; otherwise ""."""
+    rows = explanations[0].rows
+    factors = [e.factor for e in explanations if (e.factor or 0.0) > 0.0 and e.rows == rows]
+    if len(rows) < 2 or len(factors) < len(explanations):
+        return ""
+    return (
+        "Take one of these readings again. It shows by which factor all of them are too small or "
+        f"too large: multiply them by {joined([f'{f:.6g}' for f in factors], 'or')}."
     )
 
 
