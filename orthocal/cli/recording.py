@@ -353,6 +353,8 @@ class Dialogue:
         """Lines of the most likely mistakes, if no finding names a line; empty if unknown."""
         excluded, rows = self._rows_with_warning(), self._recording.rows
         measured = [r for i, r in enumerate(rows) if r.is_read and i not in excluded]
+        if not measured:
+            return []
         try:
             suspected = find_suspected_rows(self._recording.measured(without=excluded))
         except (OrthocalError, np.linalg.LinAlgError):
