@@ -313,8 +313,8 @@ def test_a_contradiction_names_the_lines_of_the_most_likely_mistakes(root, run, 
 def test_no_lines_are_suspected_if_warnings_name_all(root, tmp_path):
     blank(root / "examples/workshop", tmp_path / "typed")
     folder = tmp_path / "typed"
-    dialogue = recording.Dialogue(open_recording(folder), str(folder))
-    assert dialogue._find_suspected_lines() == []
+    with open_recording(folder) as opened:
+        assert recording.Dialogue(opened, str(folder))._find_suspected_lines() == []
 
 
 def test_a_reading_that_shows_another_offset_is_no_contradiction(root, run, tmp_path):
