@@ -6,7 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import plans
 import pytest
+import yaml
 from calibrated import plan_of, session_of
 
 from orthocal import draw_errors, load_plan, simulate_session
@@ -18,16 +20,8 @@ from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.session.session import Reading
 from orthocal.units import MM
 
-NEAR_THE_EDGE = """robot: orthoglide
+NEAR_THE_EDGE = """
 gauge: {sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5], tip: {ball: {radius_mm: 1.5}}}
-postures:
-  zero: {tcp_mm: [0, 0, 0]}
-  x_max: {tcp_mm: [60, 0, 0]}
-  x_min: {tcp_mm: [-100, 0, 0]}
-  y_max: {tcp_mm: [0, 60, 0]}
-  y_min: {tcp_mm: [0, -100, 0]}
-  z_max: {tcp_mm: [0, 0, 60]}
-  z_min: {tcp_mm: [0, 0, -100]}
 controller: {offsets_mm: [0, 0, 0]}
 calibration: {tolerances: {"*.offset_mm": 4}}
 setups:
@@ -36,7 +30,8 @@ setups:
   xz: {leg: z, direction: x, section: {fraction: 0.5}, touches: a, beside_mm: [0, 5, 0],
     postures: [z_max, zero, z_min], aligned_at: z_max}
 """
-"""Plan whose last reading is near the edge of the rod if the offset of y is large."""
+"""Keys of a plan of the paper's postures; its reading `xz z_min` is near the edge of the rod if the
+offset of y is large."""
 
 ZERO = 1.0
 """Standard deviation of a free gauge zero in the dense covariance, [m]: 10⁵ times the noise."""
@@ -208,8 +203,10 @@ def test_a_correct_reading_near_the_edge_of_a_rod_is_not_contradicted(tmp_path, 
 
     The nominal machine predicts the reading to 0.1 mm, although it is wrong by more than 1 mm.
     """
-    (tmp_path / "session.yaml").write_text(NEAR_THE_EDGE)
-    session = simulate_session(load_plan(tmp_path), {"y_slide.offset": offset}, seed=1).session
-    row = len(session.readings) - 1
+    keys = plans.paper() | yaml.safe_load(NEAR_THE_EDGE)
+    (tmp_path / "session.yaml").write_text(yaml.safe_dump(keys, sort_keys=False))
+    plan = load_plan(tmp_path)
+    session = simulate_session(plan, {"y_slide.offset": offset}, seed=1).session
+    row = [(r.setup, r.posture) for r in session.readings].index(("xz", "z_min"))
     mean, std = LinearModel(session).compare_row(session.values, row)
     assert abs(session.values[row] - mean) < 2.0 * std
