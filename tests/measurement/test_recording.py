@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -25,8 +24,8 @@ from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
 
-KILLS = 12
-"""A third of kills fall between journal and CSV: 25 without one are unlikely (4e-5)."""
+STEPS = (*range(3, 11), *range(40, 52))
+"""Steps of writing at which a recording is killed: some of its start, all of several readings."""
 FORK = multiprocessing.get_context("fork")
 
 PLAN = """# a comment that stays
@@ -315,12 +314,33 @@ def test_a_damaged_journal_is_refused_and_nothing_changes(plan, content, message
     assert (plan / "readings.csv").read_bytes() == csv
 
 
-def talk(folder, lines, said):
-    """In a child: record with what comes from a pipe, and answer into another."""
+def kill_at(step):
+    """Kill this process at a step of writing; a line of the journal is half written then."""
+    left = step
+
+    def stopping(original):
+        def do(*args, **kwargs):
+            nonlocal left
+            left -= 1
+            if left <= 0:
+                if original is write:
+                    original(args[0], args[1][: len(args[1]) // 2])
+                os.kill(os.getpid(), signal.SIGKILL)
+            return original(*args, **kwargs)
+
+        return do
+
+    write = os.write
+    os.write, os.fsync, os.replace = map(stopping, (os.write, os.fsync, os.replace))
+
+
+def talk(folder, lines, said, step):
+    """In a child: record with what comes from a pipe, and answer into another, until killed."""
     os.dup2(lines, 0)
     os.dup2(said, 1)
     sys.stdin = os.fdopen(0, "r", encoding="utf-8", closefd=False)
     sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    kill_at(step)
     with ending_at_interrupt():
         record.record(folder)
 
@@ -329,19 +349,19 @@ KEPT = re.compile(r"Recorded: line \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.
 
 
 def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
-    """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
+    """Killed at all steps of writing, while readings, corrections and repeats come in."""
     monkeypatch.setenv("COLUMNS", "100")
     folder = make_plan(tmp_path / "session", cycles=60)  # more than are read before all ends
-    monkeypatch.setattr(recording.Dialogue, "_is_doubtful", lambda *_: False)
-    monkeypatch.setattr(recording.Dialogue, "_judge", lambda *_: None)
+    monkeypatch.setattr(recording.Dialogue, "_is_doubtful", lambda *_, **__: False)
+    monkeypatch.setattr(recording.Dialogue, "_judge", lambda *_, **__: False)
     robot = load_plan(folder).robot
     monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
     rng = np.random.default_rng(0)
-    accepted, restored, busy = {}, 0, 0
-    for _ in range(KILLS):
+    accepted, restored = {}, []
+    for step in STEPS:
         lines_out, lines_in = os.pipe()
         said_out, said_in = os.pipe()
-        child = FORK.Process(target=talk, args=(folder, lines_out, said_in))
+        child = FORK.Process(target=talk, args=(folder, lines_out, said_in, step))
         child.start()
         os.close(lines_out)
         os.close(said_in)
@@ -354,23 +374,19 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
                 text += ["back", f"{value / 100 - 0.01:.2f}"]
         os.write(lines_in, ("\n".join(text) + "\n").encode()[:60_000])
         answer = b""
-        while b"Recorded: line" not in answer:  # what comes before is the same every time
-            answer += os.read(said_out, 65536)
-        time.sleep(float(rng.uniform(0.0, 0.05)))
-        os.kill(child.pid, signal.SIGKILL)
-        child.join()
-        os.close(lines_in)
         while more := os.read(said_out, 65536):
             answer += more
         os.close(said_out)
+        os.close(lines_in)
+        child.join()
+        assert child.exitcode == -signal.SIGKILL
         found = KEPT.findall(answer.decode())
-        busy += bool(found)
         numbers = [float(line) for line in text if line[-1].isdigit()]
         assert [float(value) for *_, value in found] == numbers[: len(found)]
         accepted |= {(s, p, int(c or 1)): float(v) for s, p, c, v in found}
         with open_recording(folder) as r:  # it loads as it lies there, whenever it was
             assert r.restored <= 1
-            restored += r.restored
+            restored.append(r.restored)
             there = {
                 row.key[:2] + row.key[3:]: round(row.value / MM, 9) for row in r.rows if row.is_read
             }
@@ -379,9 +395,8 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
         # one more may be there, of which nothing could be said any more: what was typed next
         assert list(other.values()) in ([], [numbers[len(found)]])
         accepted = there
-    assert busy == KILLS
-    assert len(accepted) > KILLS // 2
-    assert restored > 0
+    assert len(accepted) > len(STEPS)
+    assert sorted(set(restored)) == [0, 1]
 
 
 @pytest.mark.parametrize(
