@@ -1,6 +1,6 @@
 """Cache of a robot's CasADi functions, in memory and on disk.
 
-The key of a function covers the loaded robot, the code that builds functions, and the versions of
+The key of a function covers what it depends on, the code that builds functions, and the versions of
 CasADi and Pinocchio.
 """
 
@@ -47,25 +47,24 @@ class _Recipe:
     build: Callable[[], ca.Function] = field(compare=False)
 
 
-def function_key(robot: Robot, name: str) -> str:
-    """Key of a robot's function.
+def function_key(name: str, *contents: str) -> str:
+    """Key of a function.
 
     Args:
-        robot: The robot.
-        name: Name of the function, unique among the functions of the robot.
+        name: Name of the function, unique among those with the same contents.
+        contents: Digests of all that the function depends on, such as `fingerprint`.
     """
-    return f"function {name}\n{fingerprint(robot)}\n{_code()}"
+    return "\n".join((f"function {name}", *contents, _code()))
 
 
-def cached_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-    """Load a function of a robot from memory or disk, or build it.
+def cached_function(key: str, build: Callable[[], ca.Function]) -> ca.Function:
+    """Load a function from memory or disk, or build it.
 
     Args:
-        robot: The robot.
-        name: Name of the function, unique among the functions of the robot.
+        key: Key of the function (see `function_key`).
         build: Builds the function.
     """
-    return _load_or_build(_Recipe(function_key(robot, name), build))
+    return _load_or_build(_Recipe(key, build))
 
 
 @lru_cache(maxsize=MAX_FUNCTIONS)

@@ -1,14 +1,15 @@
 """Compiled functions of a robot: loop closures, tool and frames, with their derivatives.
 
 Their inputs are the actual drive coordinates, the passive coordinates and the placements with
-errors (see `ErrorMap`). One function therefore serves all machines, sessions, models and choices of
-free errors. Derivatives follow the geometry: a joint or an error that acts in a frame X moves
-another frame b by the twist Ad(b⁻¹ X) ξ. This needs several times fewer operations than
-differentiating the expressions and is as exact.
+errors (see `ErrorMap`). One function therefore serves all machines, sessions, models, tolerances
+and choices of free errors. Derivatives follow the geometry: a joint or an error that acts in a
+frame X moves another frame b by the twist Ad(b⁻¹ X) ξ. This needs several times fewer operations
+than differentiating the expressions and is as exact.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,8 +22,13 @@ from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
 from orthocal.kinematics.function_cache import cached_function, cached_per_robot, function_key
 from orthocal.kinematics.se3 import log6_jacobian
-from orthocal.kinematics.symbolic import Pose, SymbolicTree, closure_residual
-from orthocal.robot.frames import carriers
+from orthocal.kinematics.symbolic import (
+    Pose,
+    SymbolicTree,
+    closure_residual,
+    nominal_placement,
+)
+from orthocal.robot.frames import Placement, carriers
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
 
@@ -109,6 +115,30 @@ class RobotFunctions:
     def second(self) -> RobotFunctions:
         """Functions in a second posture, with separate symbols of all coordinates."""
         return RobotFunctions(self.robot, placements=self.placements)
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of all that the expressions depend on; robots with equal digests share functions.
+
+        Moved placements are inputs of the functions, so that their nominal values do not count.
+        """
+        robot, model = self.robot, self.robot.model
+        n_joints = model.njoints
+        placements = [Placement(i, False) for i in range(1, n_joints)]
+        placements += [Placement(i, True) for i in range(model.nframes)]
+        fixed = [p for p in placements if p not in set(self.errors.moved)]
+        parts: list[object] = [
+            [(j.shortname(), j.idx_v, j.nv) for j in model.joints],
+            [joint_axis(model, i).tolist() for i in range(1, n_joints) if model.joints[i].nv == 1],
+            list(model.parents),
+            [(f.name, f.parentJoint, f.parentFrame) for f in model.frames],
+            [(p, nominal_placement(model, p).homogeneous.tolist()) for p in fixed],
+            (self.errors.moved, self.errors.in_reference),
+            (robot.closures, closure_row_units(robot).tolist(), robot.tcp and robot.tcp.frame),
+            (robot.drive_index.tolist(), robot.passive_index.tolist()),
+            robot.reference_passive.tolist(),
+        ]
+        return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()
 
     @property
     def n_twists(self) -> int:
@@ -317,7 +347,7 @@ class RobotFunctions:
             lambda: self._function(name, outputs, sparse=sparse),
             matrices=[f"y{i}" for i in matrices],
             sparse=[f"y{i}" for i in sparse],
-            key=function_key(self.robot, name),
+            key=function_key(name, self.digest),
         )
 
     def _function(
@@ -331,7 +361,7 @@ class RobotFunctions:
             labels = [f"y{i}" for i in range(len(values))]
             return ca.Function(name, self.symbols, values, inputs, labels)
 
-        return cached_function(self.robot, name, build)
+        return cached_function(function_key(name, self.digest), build)
 
 
 @cached_per_robot(maxsize=8)

@@ -22,7 +22,7 @@ OFF = frozenset({"", "0", "off", "no", "none"})
 """Values of the variable that disable the cache."""
 
 LARGEST_TOTAL = 64 * 2**20
-"""Largest size of all files together, [bytes]; the oldest are removed first."""
+"""Largest size of all files together, [bytes]; those used longest ago are removed first."""
 
 LARGEST_ENTRY = 8 * 2**20
 """Largest size of one file, [bytes]."""
@@ -61,7 +61,7 @@ def store(key: str, content: bytes) -> None:
     with suppress(OSError, ValueError), _opened_folder(create=True) as folder:
         if folder is not None:
             _write(folder, key, content)
-            _remove_oldest(folder)
+            _remove_unused(folder)
 
 
 def cache_folder() -> Path | None:
@@ -120,6 +120,8 @@ def _read(folder: int, key: str) -> bytes | None:
         if not (stat.S_ISREG(status.st_mode) and is_small and _is_private(status)):
             return None
         data = stream.read(status.st_size)
+        with suppress(OSError, TypeError):
+            os.utime(descriptor)  # it was used now: what was used long ago is removed first
     header, content = data[:_HEADER_SIZE], data[_HEADER_SIZE:]
     return content if header == _MAGIC + _digest(key, content) else None
 
@@ -138,8 +140,8 @@ def _write(folder: int, key: str, content: bytes) -> None:
         raise
 
 
-def _remove_oldest(folder: int) -> None:
-    """Remove the oldest files until the remaining ones are within the limits."""
+def _remove_unused(folder: int) -> None:
+    """Remove the files used longest ago until the remaining ones are within the limits."""
     entries = []
     for name in os.listdir(folder):
         if name.endswith((_SUFFIX, ".part")):

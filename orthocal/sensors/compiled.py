@@ -20,6 +20,7 @@ from orthocal.errors import OrthocalError
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.function_cache import (
     cached_function,
+    fingerprint,
     function_key,
     identify,
     source_digest,
@@ -30,6 +31,9 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
 
 INPUTS = ["actuated", "passive", "placements", "zero", "constants", "nuisance"]
+
+FUNCTIONS = "reading", "reading jacobian"
+"""Names of the functions of a reading."""
 
 SECOND_INPUTS = ["actuated_2", "passive_2"]
 """Additional inputs for a pair of postures: coordinates in the second posture."""
@@ -110,6 +114,19 @@ class _Pattern:
         """Name that is unique among the patterns of the robot."""
         return repr(self._key[2:])
 
+    @property
+    def digests(self) -> tuple[str, ...]:
+        """Digests of what the expression depends on, besides the name.
+
+        Sensors and effects of other packages may use any property of the robot.
+        """
+        effects = reading_effects(self.robot)
+        kinds: list[type] = [type(self.sensor), *(type(e) for e in effects)]
+        declared = repr([(type(e), self.robot.declared.effects.get(e.name)) for e in effects])
+        foreign = any(source_digest(kind) for kind in kinds)
+        whole = (fingerprint(self.robot),) if foreign else ()
+        return (robot_functions(self.robot).digest, declared, *whole)
+
     @cached_property
     def expressions(self) -> tuple[list[ca.SX], list[ca.SX]]:
         """Inputs and outputs of the compiled functions."""
@@ -125,20 +142,15 @@ class _Pattern:
 @lru_cache(maxsize=256)
 def _compile(pattern: _Pattern) -> CompiledReading:
     """Compile the functions of a pattern, or load them from the cache."""
+    keys = [function_key(f"{name} {pattern.name}", *pattern.digests) for name in FUNCTIONS]
     value, jacobian = (
-        cached_function(pattern.robot, f"{name} {pattern.name}", partial(build, pattern))
-        for name, build in (("reading", _build_value), ("reading jacobian", _build_jacobian))
+        cached_function(key, partial(build, pattern))
+        for key, build in zip(keys, (_build_value, _build_jacobian), strict=True)
     )
     rows = [name for name in jacobian.name_out() if name not in ("h", "by_twists")]
-
-    def key(name: str) -> str:
-        return function_key(pattern.robot, f"{name} {pattern.name}")
-
     return CompiledReading(
-        value=BatchFunction(value, key=key("reading")),
-        jacobian=BatchFunction(
-            jacobian, matrices=rows, sparse=["by_twists"], key=key("reading jacobian")
-        ),
+        value=BatchFunction(value, key=keys[0]),
+        jacobian=BatchFunction(jacobian, matrices=rows, sparse=["by_twists"], key=keys[1]),
         expression=jacobian,
         name=pattern.name,
         conditions=pattern.conditions,

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import os
 import stat
+from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from conftest import load_afresh
 
 from orthocal.kinematics.robot_functions import RobotFunctions
+from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.robot import urdf
+from orthocal.robot.frames import Placement
+from orthocal.robot.model import closure_row_units
 from orthocal.runtime import disk_cache as cache
 
 KEY = "a key"
@@ -116,7 +121,7 @@ def test_a_file_of_another_key_is_not_trusted(folder):
     assert cache.load(KEY) is None
 
 
-def test_the_size_is_bounded_and_the_oldest_are_removed(folder, monkeypatch):
+def test_the_size_is_bounded(folder, monkeypatch):
     monkeypatch.setattr(cache, "LARGEST_TOTAL", 1000)
     for i in range(10):
         cache.store(f"key {i}", bytes(200))
@@ -130,6 +135,16 @@ def test_the_size_is_bounded_and_the_oldest_are_removed(folder, monkeypatch):
     monkeypatch.setattr(cache, "LARGEST_ENTRY", 10)
     cache.store("key 11", bytes(11))
     assert cache.load("key 11") is None
+
+
+def test_what_was_used_lately_is_kept(folder, monkeypatch):
+    monkeypatch.setattr(cache, "MOST_ENTRIES", 2)
+    for i in range(2):
+        cache.store(f"key {i}", b"")
+        os.utime(folder / cache._name(f"key {i}"), (i, i))
+    assert cache.load("key 0") is not None
+    cache.store("key 2", b"")
+    assert [cache.load(f"key {i}") for i in range(3)] == [b"", None, b""]
 
 
 def test_a_failed_write_leaves_the_old_content(folder, monkeypatch):
@@ -166,12 +181,33 @@ def test_cached_functions_equal_built_ones(folder):
         assert np.array_equal(ours, theirs)
 
 
-def test_another_machine_has_other_functions(folder, orthoglide):
-    _ = RobotFunctions(orthoglide).closure_by_passive.function
-    count = len(list(folder.glob("*.kept")))
-    machine = orthoglide.with_errors({"x_coupler.x": 1e-3})
-    _ = RobotFunctions(machine).closure_by_passive.function
-    assert len(list(folder.glob("*.kept"))) == count + 1
+def test_machines_of_other_dimensions_and_tolerances_share_functions(folder, orthoglide):
+    _ = RobotFunctions(orthoglide).closure_jacobian.layout
+    files = sorted(folder.glob("*.kept"))
+    machine = orthoglide.with_errors({"x_coupler.x": 9e-3}).with_tolerances({"*.offset_mm": 3.0})
+    shared = RobotFunctions(machine)
+    where = machine.drive_zero[None], np.full((1, machine.passive_index.size), 0.1)
+    where = (*where, shared.errors.placements(np.zeros(len(shared.errors.names))))
+    ours = shared.closure_jacobian(*where)
+    assert sorted(folder.glob("*.kept")) == files
+    plain = SymbolicRobot(machine, drives=ca.SX(machine.drive_zero), passive=ca.SX(where[1][0]))
+    theirs = plain.closure_residual() * closure_row_units(machine)
+    assert np.allclose(ours[0][0], np.array(ca.DM(theirs))[:, 0], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        # a frame in which no error acts
+        lambda r: r.displaced({Placement(r.frame_id("platform_mount"), True): np.full(6, 0.1)}),
+        lambda r: replace(r, closures=r.closures[1:]),
+        lambda r: replace(r, closures=tuple(replace(c, rows=c.rows[:1]) for c in r.closures)),
+        lambda r: replace(r, reference_posture=r.reference_posture + 1e-3),
+        lambda r: replace(r, tcp=None),
+    ],
+)
+def test_functions_depend_on_all_that_is_not_an_input(orthoglide, change):
+    assert RobotFunctions(change(orthoglide)).digest != RobotFunctions(orthoglide).digest
 
 
 def test_yourdfpy_checks_the_same_content_once(folder, monkeypatch):

@@ -19,7 +19,7 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import Hessian
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.symbolic_problem import ReadingExpressions, SymbolicProblem
-from orthocal.kinematics.function_cache import cached_function
+from orthocal.kinematics.function_cache import cached_function, fingerprint, function_key
 
 
 class SparseSum:
@@ -278,7 +278,8 @@ class ProgramFunctions:
         parts = [name, self.hessian, self.loss.kind, self._symbolic.error_map.digest]
         parts += [problem.passive_scale.tobytes().hex(), str(problem.n_free - problem.n_machine)]
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-        return cached_function(problem.robot, f"program {digest}", build)
+        key = function_key(f"program {digest}", fingerprint(problem.robot))
+        return cached_function(key, build)
 
     def _reading_functions(
         self, expressions: ReadingExpressions, names: Sequence[str]
