@@ -36,9 +36,6 @@ from orthocal.statistics.zeros import project_out_zeros
 MIN_ROWS = 3
 """Number of shared rows below which the correlation of residuals is unknown."""
 
-SIGNIFICANCE = 0.05
-"""Probability by chance below which a correlation of residuals is significant."""
-
 
 @dataclass(frozen=True, slots=True)
 class DeviationTest:
@@ -134,7 +131,7 @@ class Repetition:
         """True if the residuals are mainly unmodelled errors, not noise; None if unknown."""
         if math.isnan(self.p_value):
             return None
-        return self.p_value < SIGNIFICANCE and self.correlation > 0.0
+        return self.p_value < BY_CHANCE and self.correlation > 0.0
 
     def to_document(self) -> dict[str, Any]:
         """Entries of the JSON document."""

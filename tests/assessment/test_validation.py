@@ -153,9 +153,9 @@ def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
         fit = repeat_fit(before, after)
         probabilities.append(judge_deviations(before, fit).p_value)
         repeats.append(measure_repetition(before, assemble_calibration(fit)).repeats)
-    # 1 % and 5 % by construction
+    # 1 % by construction
     assert sum(p < BY_CHANCE for p in probabilities) <= binom.ppf(0.99, count, BY_CHANCE)
-    assert sum(map(bool, repeats)) <= binom.ppf(0.99, count, 0.05)
+    assert sum(map(bool, repeats)) <= binom.ppf(0.99, count, BY_CHANCE)
     assert np.mean(probabilities) == pytest.approx(0.5, abs=3.0 / np.sqrt(12 * count))
 
 
