@@ -63,7 +63,7 @@ def draw_errors(
         robot: The robot.
         patterns: Names or globs of the parameters to draw; '!' excludes. If a sum and its terms are
             selected, only the terms are drawn.
-        seed: Seed of the random numbers.
+        seed: Seed of the random numbers; `simulate_session` with this seed draws others.
         tolerances: Names or globs with their unit, such as `*.offset_mm`, mapped to tolerances that
             replace those of the robot.
 
@@ -76,7 +76,9 @@ def draw_errors(
     require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
     require_names(patterns, argument="patterns")
     require_seed(seed)
-    rng = np.random.default_rng(seed)
+    # a spawned stream is independent of those of noise (seed), of nuisance parameters (seed, 1)
+    # and of studies (seed, number)
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
     parameters = robot.parameters.with_tolerances(tolerances or {})
     chosen = parameters.without_sums(parameters.select(patterns))
     drawn = {n: float(rng.normal() * parameters[n].prior_std) for n in chosen}

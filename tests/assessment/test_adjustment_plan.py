@@ -32,7 +32,7 @@ from orthocal.output.report.page import build_report
 from orthocal.output.text.adjustment import render_plan
 from orthocal.output.text.layout import to_text
 
-SEEDS = (4,)
+SEEDS = (8,)
 
 
 def machine_of(plan, seed, **options):
@@ -84,17 +84,17 @@ def test_amounts_are_multiples_of_the_step_within_the_limits(plans):
 
 
 def test_each_printed_tool_error_is_visibly_lower(plan, plans):
-    """By 4 % and 1 µm. Machine 6 has an adjustment that does so with the next one only."""
-    sixth = plan_adjustments(machine_of(plan, 6)[1])
-    assert [p.tool_error is None for p in sixth.adjustments] == [False, True, False]
-    for planned in (*plans.values(), sixth):
+    """By 4 % and 1 µm. Machine 12 has an adjustment that does so with the next one only."""
+    other = plan_adjustments(machine_of(plan, 12)[1])
+    assert [p.tool_error is None for p in other.adjustments] == [False, False, True, False]
+    for planned in (*plans.values(), other):
         errors = [p.tool_error for p in planned.adjustments if p.tool_error is not None]
         errors.insert(0, planned.before.entered)
         assert (np.diff(np.round(errors, 6)) <= -0.99e-6).all()
         assert all(b < (1.0 - LEAST_GAIN) * a for a, b in pairwise(errors))
-    rows = [line.split() for line in to_text(render_plan(sixth, saved=None)).splitlines()]
-    cells = {row[0]: len(row) for row in rows if row[:1] in (["1"], ["2"], ["3"])}
-    assert cells["2"] == cells["1"] - 1
+    rows = [line.split() for line in to_text(render_plan(other, saved=None)).splitlines()]
+    cells = {row[0]: len(row) for row in rows if row[:1] in (["1"], ["2"], ["3"], ["4"])}
+    assert cells["3"] == cells["1"] - 1
 
 
 def search_of(calibration):
@@ -106,9 +106,9 @@ def search_of(calibration):
 
 def test_no_other_pair_is_much_better(machines, plans):
     """Forward selection with exchange may miss the best one by LEAST_GAIN."""
-    search = search_of(machines[4][1])
-    chosen = search.choose()
-    assert len(chosen) == len(plans[4].adjustments) == 2
+    search = search_of(machines[8][1])
+    chosen = sorted(search.choose())
+    assert len(chosen) == len(plans[8].adjustments) == 2
     own = search.error(search.fit(chosen))
     best = min(search.error(search.fit(t)) for t in itertools.combinations(range(15), len(chosen)))
     assert best <= own < best * (1.0 + LEAST_GAIN)
@@ -116,7 +116,7 @@ def test_no_other_pair_is_much_better(machines, plans):
 
 def test_best_amounts_are_a_minimum(machines):
     """Within their limits no change of an amount is better, by central differences."""
-    search = search_of(machines[4][1])
+    search = search_of(machines[8][1])
     chosen = search.choose()
     amounts = search.fit(chosen)
     own = search.error(amounts)
@@ -129,7 +129,7 @@ def test_best_amounts_are_a_minimum(machines):
 
 def test_first_order_effects_are_those_of_the_adjusted_machine(machines):
     """With offsets entered again, against loops closed with the amounts."""
-    calibration = machines[4][1]
+    calibration = machines[8][1]
     search = search_of(calibration)
     plain = search_of(calibration)
     for i in (1, 4, 7):
@@ -142,7 +142,7 @@ def test_first_order_effects_are_those_of_the_adjusted_machine(machines):
 
 
 def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
-    calibration = machines[4][1]
+    calibration = machines[8][1]
     search = search_of(calibration)
     search.max_amounts = np.full(15, 1.0)
     chosen = search.choose()[:2]
@@ -161,7 +161,7 @@ def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
 
 
 def test_an_adjusted_calibration_is_the_machine_with_its_amounts(machines):
-    _, calibration = machines[4]
+    _, calibration = machines[8]
     adjusted = adjust_calibration(calibration, {"x_outer_foot_z": 0.3e-3})
     terms = dict(calibration.robot.parameters["x_outer_foot_z.adjustment"].terms)
     moved = {n: calibration.errors[n] + 0.3e-3 * c for n, c in terms.items()}
@@ -204,15 +204,15 @@ def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
 
 
 def test_adjustments_with_uncertain_gain_are_details(plans):
-    assert plans[4].judgement == "worthwhile"
-    uncertain = replace(plans[4], displacement_uncertainty=1.0)
+    assert plans[8].judgement == "worthwhile"
+    uncertain = replace(plans[8], displacement_uncertainty=1.0)
     assert uncertain.judgement == "uncertain gain"
 
     def show(plan, **options):
         return to_text(render_plan(plan, saved=None, **options))
 
-    names = [p.adjustment.name for p in plans[4].adjustments]
-    assert all(name in show(plans[4]) for name in names)
+    names = [p.adjustment.name for p in plans[8].adjustments]
+    assert all(name in show(plans[8]) for name in names)
     assert not any(name in show(uncertain) for name in names)
     assert "--details" in show(uncertain)
     assert all(name in show(uncertain, details=True) for name in names)
@@ -225,8 +225,8 @@ def test_a_robot_without_adjustments_is_refused():
 
 @pytest.mark.parametrize(("sign", "confirmed"), [(1.0, True), (-1.0, False)])
 def test_validation_expects_the_adjusted_machine(plan, machines, plans, sign, confirmed):
-    errors, calibration = machines[4]
-    amounts = plans[4].amounts
+    errors, calibration = machines[8]
+    amounts = plans[8].amounts
     adjusted = adjust_calibration(calibration, amounts)
     entered = plan.with_controller(offsets_to_enter(adjusted))
     now = {**errors, **{f"{n}.adjustment": sign * v for n, v in amounts.items()}}
@@ -237,7 +237,7 @@ def test_validation_expects_the_adjusted_machine(plan, machines, plans, sign, co
 
 @pytest.mark.usefixtures("short_reports", "without_sensor_gains")
 def test_command_and_report_list_the_planned_adjustments(machines, tmp_path):
-    _, calibration = machines[4]
+    _, calibration = machines[8]
     write_calibration(calibration, tmp_path / "calibration.json")
     code, out, _ = run("adjust", tmp_path)
     assert code == 0

@@ -110,7 +110,7 @@ def test_walk_of_the_owner_of_a_printer(tmp_path, firmware):
 def calibrated(tmp_path_factory):
     """A calibration of a printer whose errors are known, in the place of its estimate."""
     folder = tmp_path_factory.mktemp("printer")
-    printer = make_printer(folder, 7)
+    printer = make_printer(folder, 8)
     (folder / "log.txt").write_text(
         probe_log("klipper", printer, nominal(), np.random.default_rng(2))
     )

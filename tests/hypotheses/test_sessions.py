@@ -337,14 +337,14 @@ def days(raw_cycles):
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_displaced_gauge_is_named_beside_another_session(days, order):
-    """The closing reading that differs does not count as noise. A drift may look the same."""
+    """The closing reading that differs does not count as noise."""
     values = days[0].values
     rows = [i for i, r in enumerate(days[0].readings) if r.setup == "xy"][-2:]
     values[rows] += 0.3e-3
     sessions = [days[0].with_values(values), days[1]]
     (found,) = find_anomalies(join_sessions([sessions[i] for i in order])).found
     e = found.explanation
-    assert (e.kind, {a.kind for a in found.alternatives}) == ("displaced gauge", {"drift"})
+    assert (e.kind, {a.kind for a in found.alternatives}) == ("displaced gauge", set())
     assert [i % len(values) for i in e.rows] == rows
     assert e.amount == pytest.approx(0.3e-3, abs=0.05e-3)
 
@@ -392,7 +392,7 @@ def test_memory_is_linear_in_the_readings(raw_cycles):
 
 def test_no_machine_changes_by_a_hundred_tolerances(plan):
     """Readings of the second session that a change of 200 prior standard deviations explains."""
-    session = measure_twice(plan, ENTERED)
+    session = measure_twice(plan, ENTERED, seed=0)
     model = LinearModel(session)
     column = model.at_reference(keep_jacobian=True).jacobian[:, model.problem.free.index(TILT)]
     values = session.values + 200.0 * np.where(model.session_of_entry == 1, column, 0.0)

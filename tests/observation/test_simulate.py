@@ -81,6 +81,28 @@ def test_the_shipped_session_is_what_its_truth_gives(root, plan):
     assert load_errors(root / "examples/raw-cycles/truth.yaml", plan.robot) == errors
 
 
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("sweep", 2),
+        ("workshop", 5),
+        ("biglide", 1),
+        ("inclined_orthoglide", 1),
+        ("linear_delta", 1),
+    ],
+)
+def test_shipped_readings_are_those_of_the_shipped_truth(root, name, seed):
+    folder = root / "examples" / name
+    plan = load_plan(folder / "plan.yaml")
+    nuisance = nuisance_parameters(plan).parameters
+    errors = load_errors(folder / "truth.yaml", plan.robot, nuisance)
+    if name == "sweep":  # as the comment of its plan states
+        errors |= {p.name: 0.0 for p in nuisance}
+    simulated = simulate_session(plan, errors, seed=seed).session
+    assert f"--seed {seed} " in (folder / "plan.yaml").read_text()
+    assert np.abs(simulated.values - load_session(folder).values).max() < KINEMATICS
+
+
 def test_drawn_errors_have_their_tolerances(orthoglide):
     draws = [draw_errors(orthoglide, ["*", "!frame.*"], seed=s) for s in range(60)]
     scaled = np.array(
@@ -88,6 +110,27 @@ def test_drawn_errors_have_their_tolerances(orthoglide):
     )
     assert abs(scaled.std() - 1.0) < 4.0 / np.sqrt(2 * scaled.size)
     assert abs(scaled.mean()) < 4.0 / np.sqrt(scaled.size)
+
+
+def test_drawn_errors_share_no_numbers_with_noise_and_sensors(plan):
+    """With one seed for all, as in `simulate --draw '*' --seed 2`."""
+    fine = plan.with_gauge(replace(plan.gauge, resolution=None, range=None))
+    parameters = [*plan.robot.parameters, *nuisance_parameters(fine).parameters]
+    std = {p.name: p.prior_std for p in parameters}
+    products = []
+    for seed in range(300):
+        errors = draw_errors(plan.robot, ["*"], seed=seed)
+        simulated = simulate_session(fine, errors, seed=seed)
+        zeros = [simulated.zeros[r.setup] for r in plan.readings]
+        nuisance = np.array(list(simulated.nuisance.values()))
+        noise = simulated.session.values - predict_readings(fine, errors, nuisance=nuisance) - zeros
+        sensors = [value / std[name] for name, value in simulated.nuisance.items()]
+        others = np.concatenate([noise / plan.gauge.sigma, sensors])
+        drawn = np.array([value / std[name] for name, value in errors.items()])
+        assert np.abs(drawn[:, None] - others).min() > 1e-9
+        products.append(np.outer(drawn, others))
+    correlations = np.mean(products, axis=0)
+    assert np.abs(correlations).max() < 6.0 / np.sqrt(len(products))
 
 
 def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):

@@ -92,7 +92,7 @@ def test_a_bar_with_all_signs_reversed_is_named(tmp_path):
     assert {p.setup for p in found.places} == {"xy", "yz", "zx"}
 
 
-@pytest.mark.parametrize("seed", [3, 31])
+@pytest.mark.parametrize("seed", [2, 31])
 def test_a_later_bar_with_all_signs_reversed_is_named(tmp_path, seed):
     """To first order about the readings as stated, the reversed sign has no evidence."""
     plan = circles(tmp_path, length="0", legs=True)
