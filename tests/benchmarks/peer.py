@@ -28,6 +28,12 @@ Array = NDArray[np.float64]
 STOP = 1e-8
 """[1] SciPy's own `ftol` and `xtol`: the last step changes objective and errors by less."""
 
+REFINED_STOP = 1e-14
+"""[1] The same for `PeerProblem.refine`."""
+
+CENTRAL_STEP = 1e-6
+"""Step of central differences, [m, rad]."""
+
 MAX_NEWTON_STEPS = 60
 
 
@@ -189,6 +195,33 @@ class PeerProblem:
         if not found.success:
             raise RuntimeError(found.message)
         return PeerSolution(found.x, float(found.cost), seconds, self.evaluations)
+
+    def refine(self, errors: Array) -> PeerSolution:
+        """Continue from a solution with central differences, whose optimum is nearer.
+
+        With forward differences weakly determined errors stop up to 0.007 tolerances beside it.
+
+        Args:
+            errors: The solution, shape (n_free,), [m, rad].
+        """
+        began = time.process_time()
+        found = least_squares(
+            self.residuals,
+            errors,
+            jac=self._central_jacobian,
+            method="lm",
+            x_scale=self.prior_stds,
+            ftol=REFINED_STOP,
+            xtol=REFINED_STOP,
+        )
+        seconds = time.process_time() - began
+        return PeerSolution(found.x, float(found.cost), seconds, self.evaluations)
+
+    def _central_jacobian(self, errors: Array) -> Array:
+        """Derivatives of the residuals, shape (n_readings + n_free, n_free)."""
+        steps = CENTRAL_STEP * np.eye(errors.size)
+        columns = [self.residuals(errors + e) - self.residuals(errors - e) for e in steps]
+        return np.array(columns).T / (2.0 * CENTRAL_STEP)
 
     def _section_starts(self, machine: Robot, data: pin.Data) -> Array:
         """Where the sections of each setup count from: 0, or the root in the zero posture, [m].
