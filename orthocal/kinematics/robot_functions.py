@@ -123,10 +123,10 @@ class RobotFunctions:
         Moved placements are inputs of the functions, so that their nominal values do not count.
         """
         robot, model = self.robot, self.robot.model
-        n_joints = model.njoints
+        n_joints, moved = model.njoints, set(self.errors.moved)
         placements = [Placement(i, False) for i in range(1, n_joints)]
         placements += [Placement(i, True) for i in range(model.nframes)]
-        fixed = [p for p in placements if p not in set(self.errors.moved)]
+        fixed = [p for p in placements if p not in moved]
         parts: list[object] = [
             [(j.shortname(), j.idx_v, j.nv) for j in model.joints],
             [joint_axis(model, i).tolist() for i in range(1, n_joints) if model.joints[i].nv == 1],
