@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
@@ -87,7 +87,9 @@ class _Readings:
     by_passive: Array
     """h_q, shape (S, k m, n_passive)."""
     by_nuisance: Array
-    """h_ν, shape (S, k m, n_nuisance)."""
+    """h_ν for one unit of each nuisance parameter, shape (S, k m, n_nuisance_columns)."""
+    by_alignment: Array | None
+    """Derivative through the manual alignment, shape (S, k m, n_machine); None without any."""
     by_twists: Sequence[tuple[Indices, Indices, Array]]
     """For each sensor group: positions of its readings, (n,), columns of the nonzeros of ∂h/∂ξ,
     (nnz,), and the nonzeros, (S, n, nnz)."""
@@ -142,10 +144,20 @@ class ObservationModel:
             start[index] += changes.sum(axis=1)
         return ManualAlignment(sensitivity, start)
 
-    def parametrise(self, unit_errors: Array, nuisance_scale: Array) -> FreeParameters:
-        """Free parameters for `linearise`; arguments are the fields of `FreeParameters`."""
+    def parametrise(
+        self,
+        unit_errors: Array,
+        nuisance_scale: Array,
+        nuisance_columns: Indices | None = None,
+    ) -> FreeParameters:
+        """Free parameters for `linearise`; arguments are the fields of `FreeParameters`.
+
+        By default each nuisance parameter has a column of its own.
+        """
+        if nuisance_columns is None:
+            nuisance_columns = np.arange(nuisance_scale.size)
         pattern = ClosurePattern.of(self.functions, unit_errors)
-        return FreeParameters(unit_errors, nuisance_scale, pattern)
+        return FreeParameters(unit_errors, nuisance_scale, nuisance_columns, pattern)
 
     def predict(
         self,
@@ -389,7 +401,8 @@ class ReadingLinearisation:
         batch: bool,
     ) -> None:
         self._model, self._free, self._batch = model, free, batch
-        alignment_by_theta = alignment @ free.unit_errors
+        self._alignment = alignment @ free.unit_errors
+        self._aligned: Mask = np.asarray(self._alignment.any(axis=1))
         self._machines = _Machines(model, errors)
         geometry = self._machines.geometry
         _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
@@ -400,10 +413,10 @@ class ReadingLinearisation:
         sparse = n_sets == 1 and n >= MIN_SPARSE_ROWS
         self._twists = TwistChain(map_, errors, model.states, free, sparse=sparse)
         self._by_machine = free.unit_errors[map_.drive_errors]
-        n_machine, n_nuisance = free.unit_errors.shape[1], free.nuisance_scale.size
+        n_machine = free.unit_errors.shape[1]
         reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
         correction = np.zeros_like(passive, dtype=np.float64)
-        jacobian = np.empty((n_sets, n, n_machine + n_nuisance))
+        jacobian = np.empty((n_sets, n, n_machine + free.n_nuisance_columns))
         self._blocks: list[tuple[_Block, _Closures]] = []
         for block in model.single_blocks if n_sets == 1 else model.blocks(n_sets):
             closures = self._evaluate_closures(block, passive)
@@ -415,15 +428,13 @@ class ReadingLinearisation:
             by_passive = readings.by_passive.reshape(n_sets, k, m, -1)
             reading[:, entries] = readings.value
             opening[:, entries] = (by_passive @ dq[..., None]).reshape(n_sets, k * m)
-            jacobian[:, entries, :n_machine] = self._machine_rows(block, closures, readings)
+            by_machine = self._machine_rows(block, closures, readings)
+            if readings.by_alignment is not None:
+                by_machine += readings.by_alignment
+            jacobian[:, entries, :n_machine] = by_machine
             jacobian[:, entries, n_machine:] = readings.by_nuisance
             self._blocks.append((block, closures))
         reading, opening, jacobian = (model.gather(v) for v in (reading, opening, jacobian))
-        aligned = np.flatnonzero(alignment_by_theta.any(axis=1))
-        by_nuisance = jacobian[:, :, n_machine:]
-        if aligned.size:
-            jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ alignment_by_theta[aligned]
-        by_nuisance *= free.nuisance_scale
         if (noise_ratio != 1.0).any():
             reading, opening = reading / noise_ratio, opening / noise_ratio
             jacobian /= noise_ratio[:, None]
@@ -470,7 +481,7 @@ class ReadingLinearisation:
 
     def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
         """Readings of a block and their derivatives with constant passive coordinates."""
-        model, (k, m) = self._model, block.entries.shape
+        model, free, (k, m) = self._model, self._free, block.entries.shape
         n_sets, n_passive = len(passive), passive.shape[2]
         n_drive_errors = self._by_drive_errors.shape[-1]
         by_twists: list[tuple[Indices, Indices, Array]] = []
@@ -478,7 +489,8 @@ class ReadingLinearisation:
             np.empty((n_sets, k * m)),
             np.zeros((n_sets, k * m, n_drive_errors)),
             np.zeros((n_sets, k * m, n_passive)),
-            np.zeros((n_sets, k * m, nuisance.shape[1])),
+            np.zeros((n_sets, k * m, free.n_nuisance_columns)),
+            np.zeros((n_sets, k * m, free.unit_errors.shape[1])) if self._aligned.any() else None,
             by_twists,
         )
         for index, of_second, where, part in block.members:
@@ -500,7 +512,13 @@ class ReadingLinearisation:
             by_drive_errors += h_r[:, :, None] @ self._by_reference[:, setups]
             result.value[:, where] = h[..., 0]
             result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
-            result.by_nuisance[:, where[:, None], group.nuisance[part]] = h_nu
+            which = group.nuisance[part]
+            columns = free.nuisance_columns[which]
+            result.by_nuisance[:, where[:, None], columns] = h_nu * free.nuisance_scale[which]
+            if result.by_alignment is not None:
+                for j in np.flatnonzero(self._aligned[which].any(axis=0)).tolist():
+                    by_machine = h_nu[:, :, j, None] * self._alignment[which[:, j]]
+                    result.by_alignment[:, where] += by_machine
             _, columns = group.reading.jacobian.pattern("by_twists")
             by_twists.append((where, columns, nonzeros))
         return result
@@ -560,18 +578,24 @@ def predict_readings(
     return model.predict(closure.errors(), passive, nuisance)
 
 
-def nominal_sensitivity(session: Session) -> Array:
-    """Derivative of readings with respect to all elementary errors, on the nominal machine.
+def nominal_sensitivity(session: Session, unit_errors: Array | None = None) -> Array:
+    """Derivative of readings with respect to errors of the machine, on the nominal machine.
+
+    Args:
+        session: The session.
+        unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n), [SI];
+            by default all elementary errors.
 
     Returns:
-        Shape (n_entries, n_errors), [m per SI unit of the error].
+        Shape (n_entries, n), [m per unit of the parameter].
 
     Raises:
         ClosureError: If the nominal machine cannot reach a posture.
     """
     model, closure = ObservationModel(session), LoopClosure(session.robot)
-    n = len(model.functions.errors.names)
-    free = model.parametrise(np.eye(n), np.ones(len(model.nuisance.parameters)))
+    units = np.eye(len(model.functions.errors.names)) if unit_errors is None else unit_errors
+    n = len(model.nuisance.parameters)
+    free = model.parametrise(units, np.ones(n), np.zeros(n, dtype=np.int64))  # they are not needed
     passive = closure.close(model.states.commands, names=model.states.names)
     linear = model.linearise(closure.errors(), passive, free=free, aligned=False)
-    return linear.jacobian[:, :n]
+    return linear.jacobian[:, : units.shape[1]]

@@ -28,8 +28,16 @@ class FreeParameters:
     """Elementary errors for one unit of each machine parameter, (n_errors, n_machine), [SI]."""
     nuisance_scale: Array
     """Values of one unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
+    nuisance_columns: Indices
+    """Column of each nuisance parameter after those of the machine parameters, (n_nuisance,).
+    Parameters on which no reading depends together may share a column."""
     pattern: ClosurePattern
     """Nonzeros of ∂g/∂ξ for the twists ξ that the machine parameters change."""
+
+    @property
+    def n_nuisance_columns(self) -> int:
+        """Number of columns of the nuisance parameters."""
+        return int(self.nuisance_columns.max(initial=-1)) + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

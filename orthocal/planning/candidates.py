@@ -6,6 +6,7 @@ come from the usual functions.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -241,26 +242,28 @@ def measure_candidates(
         entered: True if offsets of a calibration are active, so that the remaining ones are small.
     """
     sigma = stated_sigma(session.gauge)
-    h, jacobian = problem.predict_and_jacobian(problem.active_theta)
     n, o = problem.n_machine, problem.observations
     owners = [name.rpartition(".")[0] for name in problem.free]
     common = _find_state(session, owners, n)
-    state = tuple(problem.free[i] for i in common)
+    state, all_parts = tuple(problem.free[i] for i in common), _find_parts(session)
+    column = share_columns(owners, common, all_parts)
+    h, jacobian = _predict_and_jacobian(problem, column[n:] - n)
     stds = np.array([ENTERED_OFFSET_STD if entered and is_offset(s) else 1.0 for s in state])
     setups, margins, aligned_of = [], [], _list_aligned(session, problem)
     spans: dict[str, list[float]] = {}
     aligned_at, order = session.alignment_postures, list(session.setups)
-    for parts in _find_parts(session):
+    for parts in all_parts:
         width, name, (_, base) = len(parts), parts[0].name, names_in_files(parts[0])
         rows = np.flatnonzero(np.isin(o.setup, [order.index(p.name) for p in parts]))
         if rows.size < MIN_READINGS * width:
             continue
         of_parts = {f"setup.{part.name}" for part in parts}
-        of_setup = [i for i in range(n, len(owners)) if owners[i] in of_parts]
-        by_state, by_nuisance = jacobian[rows][:, common], jacobian[rows][:, of_setup]
+        of_setup = [column[i] for i in range(n, len(owners)) if owners[i] in of_parts]
+        of_rows = jacobian[rows]
+        by_state, by_nuisance = of_rows[:, : len(common)].copy(), of_rows[:, of_setup]
         aligned = []
         for index, alignment in aligned_of.get(name, ()):
-            sensitivity = jacobian[rows, index] / problem.theta_scale[index]
+            sensitivity = of_rows[:, column[index]] / problem.theta_scale[index]
             a = AlignedParameter(sensitivity, _about_mean(alignment, len(common)))
             first = [session.readings[i].posture for i in rows].index(aligned_at[name])
             by_state -= np.outer(a.sensitivity, a.jacobian[first])  # the session aligns it here
@@ -301,6 +304,38 @@ def _find_state(session: Session, owners: Sequence[str], n_machine: int) -> list
     return [i for i, owner in enumerate(owners) if i < n_machine or owner not in private]
 
 
+def share_columns(
+    owners: Sequence[str], common: Sequence[int], parts: list[list[Setup]]
+) -> Indices:
+    """Column of each free parameter in a Jacobian whose private columns all setups share.
+
+    Args:
+        owners: Owner of each free parameter.
+        common: Indices of the free parameters that setups share; they have the first columns.
+        parts: Setups that are read together.
+    """
+    column = np.empty(len(owners), dtype=np.int64)
+    column[common] = np.arange(len(common))
+    instrument = {f"setup.{setup.name}": i for i, of in enumerate(parts) for setup in of}
+    n_private: Counter[int] = Counter()
+    for i in sorted(set(range(len(owners))) - set(common)):
+        owner = instrument[owners[i]]
+        column[i] = len(common) + n_private[owner]
+        n_private[owner] += 1
+    return column
+
+
+def _predict_and_jacobian(
+    problem: CalibrationProblem, nuisance_columns: Indices
+) -> tuple[Array, Array]:
+    """Predicted readings and Jacobian, as of the problem but with shared columns."""
+    theta = problem.active_theta
+    scale = problem.theta_scale[problem.n_machine :]
+    free = problem.model.parametrise(problem.errors_per_theta, scale, nuisance_columns)
+    linear = problem.linearise(theta, problem.close(theta), free=free)
+    return linear.reading, linear.jacobian
+
+
 def _find_parts(session: Session) -> list[list[Setup]]:
     """Setups that are read together: the three of points, or one."""
     parts: dict[str, list[Setup]] = {}
@@ -328,7 +363,7 @@ def _list_aligned(
         # the alignment does not depend on the approach
         readings = tuple(replace(r, conditions=None) for r in session.readings if r.setup in setups)
         virtual = replace(session, setups=setups, readings=readings)
-        jacobian = nominal_sensitivity(virtual) @ problem.errors_per_theta
+        jacobian = nominal_sensitivity(virtual, problem.errors_per_theta)
         setup_of_row = build_observations(virtual).setup
         for k, name in enumerate(setups):
             index = problem.free.index(f"setup.{name}.{parameter}")

@@ -6,6 +6,7 @@ import gc
 import json
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.output.text.plan import OUT_OF_RANGE, plan_json
 from orthocal.planning import plan as planning
-from orthocal.planning.candidates import list_candidates, measure_candidates
+from orthocal.planning.candidates import list_candidates, measure_candidates, share_columns
 from orthocal.planning.cost_curve import compute_curve, find_enough
 from orthocal.planning.equipment import Equipment, choose_box, find_box
 from orthocal.planning.expected_error import ToolForecast
@@ -98,6 +99,13 @@ def test_the_error_of_the_search_is_the_posterior_of_the_session(planned):
     assert complete < without  # each first posture is read again
     errors = [s.error for s in planned.curve]
     assert errors == sorted(errors, reverse=True)
+
+
+def test_setups_share_columns_and_parts_of_an_instrument_do_not():
+    points, dial = [SimpleNamespace(name=n) for n in ("p.1", "p.2")], SimpleNamespace(name="x")
+    owners = ["x_slide", "setup.x", "setup.x", "bar", "setup.p.1", "setup.p.2"]
+    columns = share_columns(owners, [0, 3], [points, [dial]])
+    assert columns.tolist() == [0, 2, 3, 1, 2, 3]
 
 
 def test_no_usual_plan_is_better_at_equal_cost(planned):
