@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from orthocal.arrays import Array
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
@@ -22,8 +24,13 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
     passive = closure.close(drives, names=list(session.postures))
     geometry, functions = closure.geometry(), robot_functions(robot)
 
-    def poses(frame: str, rows: list[int]) -> Array:
-        return functions.pose(frame)(drives[rows], passive[rows], geometry.placements)[0]
+    @cache
+    def poses(frame: str) -> Array:
+        return functions.pose(frame)(drives, passive, geometry.placements)[0]
+
+    @cache
+    def at_zero(frame: str) -> Array:
+        return reference_poses(robot, [frame])[0]
 
     postures = {name: i for i, name in enumerate(session.postures)}
     read: dict[str, set[str]] = {name: set() for name in session.setups}  # postures by setup
@@ -34,8 +41,8 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
         names = sorted(read[setup.name], key=postures.__getitem__)
         rows, frames = [postures[n] for n in names], setup.sensor.frames(robot)
         contact = setup.sensor.contact(
-            [poses(f, rows) for f in frames.in_posture],
-            reference_poses(robot, frames.at_zero),
+            [poses(f)[rows] for f in frames.in_posture],
+            [at_zero(f) for f in frames.at_zero],
             robot,
         )
         result[setup.name] = names, contact

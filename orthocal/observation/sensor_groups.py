@@ -52,6 +52,7 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
     """Nuisance parameters of all setups with readings."""
     parameters: dict[str, Parameter] = {}
     of_setup: list[tuple[int, ...]] = []
+    index: dict[str, int] = {}
     mirrored: dict[tuple[str, ...], None] = {}
     read = {r.setup for r in session.readings}
     for setup in session.setups.values():
@@ -69,14 +70,15 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
         ]
         for parameter in setup_parameters:
             parameters.setdefault(parameter.name, parameter)
-        of_setup.append(tuple(list(parameters).index(p.name) for p in setup_parameters))
+            index.setdefault(parameter.name, len(index))
+        of_setup.append(tuple(index[p.name] for p in setup_parameters))
         vector = mirrored_parameters(setup.sensor)
         if vector:
             mirrored[tuple(f"{_owner(p, setup, session)}.{p.name}" for p in vector)] = None
     return NuisanceParameters(
         tuple(parameters.values()),
         tuple(of_setup),
-        tuple(tuple(list(parameters).index(name) for name in vector) for vector in mirrored),
+        tuple(tuple(index[name] for name in vector) for vector in mirrored),
     )
 
 

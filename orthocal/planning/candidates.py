@@ -506,7 +506,7 @@ def _with_lateral_positions(session: Session) -> Session:
             x, y, z = (float(v) for v in (k * step * side).round(9) + 0.0)
             displaced = replace(sensor, beside=(x, y, z))
             setups[new_name] = replace(session.setups[name], name=new_name, sensor=displaced)
-            readings += [replace(r, setup=new_name) for r in near]
+            readings += [Reading(new_name, r.posture) for r in near]
     return replace(session, setups=setups, readings=tuple(readings))
 
 
@@ -536,8 +536,9 @@ def _with_approaches(session: Session) -> Session:
         a: dict(zip(session.postures, can_approach(session.robot, drives, a), strict=True))
         for a in approaches
     }
+    conditions = {a: Conditions(a) for a in approaches}
     readings = tuple(
-        replace(r, conditions=Conditions(a))
+        Reading(r.setup, r.posture, conditions=conditions[a])
         for r in session.readings
         for a in approaches
         if possible[a][r.posture]

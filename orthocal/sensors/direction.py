@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,17 +24,34 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
 Direction = str | tuple[float, float, float]
 """Name of `DIRECTIONS`, or vector in the world frame, of any length."""
 
+CACHE_SIZE = 256
+"""Directions whose vectors are cached: a plan has many setups with few directions."""
+
 PARALLEL_DEG = 1.0
 """Angle to a leg below which a direction counts as along the leg."""
 
 
+@lru_cache(maxsize=CACHE_SIZE)
 def direction_vector(direction: Direction) -> Array:
-    """Unit vector of a growing reading in the world frame, shape (3,); 0 for the vector 0."""
+    """Unit vector of a growing reading in the world frame, shape (3,); 0 for the vector 0.
+
+    The array is read-only, because it is shared by all calls.
+    """
     vector = np.array(DIRECTIONS[direction] if isinstance(direction, str) else direction)
-    if isinstance(direction, str) or not vector.any():
-        return vector
-    vector = vector / np.abs(vector).max()  # avoids an overflow of the square
-    return np.asarray(vector / np.linalg.norm(vector))
+    if vector.any() and not isinstance(direction, str):
+        vector = vector / np.abs(vector).max()  # avoids an overflow of the square
+        vector = np.asarray(vector / np.linalg.norm(vector))
+    vector.flags.writeable = False
+    return vector
+
+
+@lru_cache(maxsize=CACHE_SIZE)
+def side_vector(axis: tuple[float, float, float], direction: Direction) -> Array:
+    """Unit vector across the axis of a leg and a direction, shape (3,), read-only."""
+    side = np.cross(axis, direction_vector(direction))
+    side /= np.linalg.norm(side)
+    side.flags.writeable = False
+    return side
 
 
 def direction_name(direction: Direction) -> str:

@@ -35,6 +35,7 @@ from orthocal.sensors.direction import (
     check_direction,
     direction_name,
     direction_vector,
+    side_vector,
 )
 from orthocal.sensors.mounting import EXACT, USUAL, Mounting, MountingKeys, mount
 from orthocal.sensors.protocol import (
@@ -471,8 +472,8 @@ class LegIndicator:
 
     def _side(self, robot: Robot) -> Array:
         """Unit vector across leg and plunger, shape (3,): the direction of a blade's edge."""
-        side = np.cross(robot.legs[self.leg].axis, direction_vector(self.direction))
-        return np.asarray(side / np.linalg.norm(side))
+        x, y, z = robot.legs[self.leg].axis.tolist()
+        return side_vector((x, y, z), self.direction)
 
 
 class BallIndicator(LegIndicator):
