@@ -50,7 +50,7 @@ def import_(
         sheet: Worksheet of a workbook.
         decimal (comma|point): Decimal sign of the readings.
         separator (semicolon|tab|comma|pipe): Separator of the cells.
-        unit (mm|um|inch|cm|thou): Unit of readings without a unit.
+        unit (mm|um|inch|cm|thou|hundredths): Unit of readings without a unit; hundredths of a mm.
         encoding: Encoding of the file: utf-8, utf-16, cp1252, cp850, mac-roman ...
         column (ROLE=HEADING): Role of a column: setup, posture, minus, cycle, approach,
             temperature, time, reading, 'reading 2' of cycles side by side, x, y, z of points,

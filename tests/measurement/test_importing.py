@@ -176,7 +176,7 @@ FORMS = [
     text("unit-from-option", UNITLESS, one("0.5"), unit="mm"),
     text("inch-from-option", UNITLESS, one("0.5", unit="inch"), unit="inch"),
     text("no-unit", UNITLESS, "{}:2: neither the heading 'value' nor the cell has a unit; state it "
-         "by --unit mm, um or inch"),
+         "by --unit mm, um, inch or hundredths"),
     text("other-unit-than-option", UNITLESS.replace("value", "value_mm"),
          "{}:2: the reading is in mm, which contradicts --unit um", unit="um"),
     text("other-unit-in-a-cell", HEAD + "xy;zero;0,5 µm\n",
@@ -339,7 +339,7 @@ FORMS = [
          "utf-16, utf-16-le, utf-16-be, cp1252, latin-1, cp1250, cp850, cp437, mac-roman",
          encoding_option="x"),
     text("no-such-unit", ENGLISH, "--unit: 'm' is not a unit of readings; expected mm, um, inch, "
-         "cm, thou", unit="m"),
+         "cm, thou, hundredths", unit="m"),
     text("no-such-decimal", ENGLISH, "--decimal: ',' is not a decimal sign; expected point, comma",
          decimal=","),
     text("no-such-role", ENGLISH, "--column: 'date' is not the role of a column; expected one of "

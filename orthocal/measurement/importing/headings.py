@@ -103,13 +103,14 @@ _ROLES = {word: role for role, words in WORDS.items() for word in words}
 Degrees = Literal["C", "F"]
 """Unit of a temperature: degrees Celsius or Fahrenheit."""
 
-UnitName = Literal["mm", "um", "inch", "cm", "thou"]
+UnitName = Literal["mm", "um", "inch", "cm", "thou", "hundredths"]
 UNITS: dict[UnitName, Decimal] = {
     "mm": Decimal(1),
     "um": Decimal("0.001"),
     "inch": Decimal("25.4"),
     "cm": Decimal(10),
     "thou": Decimal("0.0254"),
+    "hundredths": Decimal("0.01"),
 }
 """Units of readings and their exact sizes, [mm]."""
 
@@ -119,7 +120,8 @@ _UNIT_WORDS: dict[str, UnitName] = {
     **dict.fromkeys(("micrometre", "micrometres", "micrometers"), "um"),
     **dict.fromkeys(("inch", "inches", "in", "zoll", '"', "″", "in."), "inch"),
     **dict.fromkeys(("cm", "centimeter", "centimetre", "zentimeter"), "cm"),
-    **dict.fromkeys(("thou", "mil", "mils", "0.001 in", '0.001"', "0.001 inch"), "thou"),
+    **dict.fromkeys(("thou", "mil", "mils"), "thou"),
+    **dict.fromkeys(("hundredths", "hundredth", "hundertstel"), "hundredths"),
 }
 
 LONGEST_HEADING = 100
@@ -127,7 +129,19 @@ LONGEST_HEADING = 100
 
 _BRACKETED = re.compile(r"[\[(]([^\[\]()]*)[\])]")
 _BREAK = re.compile(r"[\s_\-/,;:\[\]()]+")
-_THOU = re.compile(r"0[.,]001[ _]?(?:inch|in(?![a-z])|\")")
+_INCHES = r"(?:inch(?:es)?|in(?![a-z])|zoll|\")"
+_THOUSANDTH = r"(?:1 ?/ ?1000|0[.,]001)[ _]?"
+_FRACTIONS: tuple[tuple[re.Pattern[str], UnitName], ...] = (
+    (re.compile(rf"{_THOUSANDTH}{_INCHES}"), "thou"),
+    (re.compile(rf"{_THOUSANDTH}mm(?![a-z])"), "um"),
+    (re.compile(r"(?:1 ?/ ?100|0[.,]01)[ _]?mm(?![a-z])"), "hundredths"),
+    (re.compile(r"(?:hundredths?(?: of)?(?: a)?|hundertstel) ?mm(?![a-z])"), "hundredths"),
+)
+"""Fractions of a millimetre or an inch that are units."""
+
+_MULTIPLE = re.compile(rf"(?:/ ?[0-9]+|0[.,][0-9]+|10+)[ _]?(?:mm|cm|[uµμ]m|{_INCHES})(?![a-z])")
+"""Other multiples of a unit, which are not supported."""
+
 _INCH = re.compile(r"(?:[/,;:_] ?|(?<![a-z])in |^)in\.?(?=_|$)")
 _DEGREES = re.compile(
     r"(?:[\s\[(,;:/_-]+|(?=[°º]))(?:in )?(?:[°º]|deg(?:rees|\.)?)? ?(c|f|celsius|fahrenheit)[\])]?"
@@ -165,8 +179,17 @@ class Columns:
 
 
 def parse_unit(text: str) -> UnitName | None:
-    """Unit named by a text such as µm; None for other text."""
-    return _UNIT_WORDS.get(" ".join(tidy_text(text).casefold().split()))
+    """Unit named by a text such as µm or 1/100 mm; None for other text."""
+    return _UNIT_WORDS.get(_name_fractions(" ".join(tidy_text(text).casefold().split())))
+
+
+def _name_fractions(plain: str) -> str:
+    """Text with fractions of a unit, such as 1/100 mm, replaced by the name of the unit."""
+    if len(plain) > LONGEST_HEADING:
+        return plain
+    for pattern, unit in _FRACTIONS:
+        plain = pattern.sub(unit, plain)
+    return plain
 
 
 def read_heading(text: str) -> Heading | None:
@@ -207,7 +230,9 @@ def _split_unit(plain: str) -> tuple[str, UnitName | None]:
     A unit in brackets has priority. The word "in" is a preposition after a blank, and the unit inch
     after any other character.
     """
-    plain = _THOU.sub("thou", plain)
+    plain = _name_fractions(plain)
+    if _MULTIPLE.search(plain):
+        return plain, None
     for bracket in _BRACKETED.finditer(plain):
         if unit := parse_unit(bracket[1].removeprefix("in ")):
             return f"{plain[: bracket.start()]} {plain[bracket.end() :]}", unit

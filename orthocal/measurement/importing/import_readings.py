@@ -55,7 +55,7 @@ class TableOptions:
     decimal: str | None = None
     """Decimal sign, comma or point; inferred by default."""
     unit: str | None = None
-    """Unit of readings without a unit: mm, um, inch, cm or thou."""
+    """Unit of readings without a unit: mm, um, inch, cm, thou or hundredths (of a mm)."""
     encoding: str | None = None
     """Encoding of a text file; detected by default."""
     columns: Mapping[str, str] = field(default_factory=dict)

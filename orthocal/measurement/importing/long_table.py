@@ -491,7 +491,7 @@ def _choose_unit(entry: Entry, stated: UnitName | None, heading: str) -> UnitNam
     if unit is None:
         raise SessionError(
             f"neither the heading '{shorten(' '.join(heading.split()))}' nor the cell has a unit; "
-            "state it by --unit mm, um or inch",
+            "state it by --unit mm, um, inch or hundredths",
             where=where,
         )
     return unit
