@@ -36,6 +36,7 @@ AnomalyKind = Literal[
     "backlash not entered",
     "backlash halved",
     "machine changed",
+    "lost steps",
 ]
 """Kinds of anomaly. `offset of one drive`: an offset that differs from the stated one and matches
 no usual mistake of entering it. `other effect`: an effect from another package."""
@@ -91,13 +92,15 @@ class Explanation:
     amount: float | None = None
     """Amount of the anomaly. Misread dial, outlier, displaced gauge: excess of the rows, [m].
     Drift: excess of the last row over the first, [m]. Other effects: range of their contributions
-    to the rows, [m]. `machine changed`: the change, [SI]. Wrong or readjusted dimension: true minus
-    stated value, [m]."""
+    to the rows, [m]. `machine changed`, `lost steps`: the change, [SI]. Wrong or readjusted
+    dimension: true minus stated value, [m]."""
     std: float | None = None
     """Standard deviation of the amount, [SI]."""
     missing: bool | None = None
     """Row offset: True if the first of the rows was not read, False if the row before was written
     twice, so that the last reading was lost."""
+    first: int | None = None
+    """Lost steps: first row that was read after the loss."""
     drives: tuple[str, ...] = ()
     """Drives whose offsets or backlashes are concerned."""
     active: tuple[float, ...] = ()

@@ -10,6 +10,7 @@ import numpy as np
 from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
+from orthocal.hypotheses.families.lost_steps import lost_steps
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.sessions import changes_between_sessions
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
@@ -32,7 +33,7 @@ SIMILAR_LOG_BAYES = 3.0
 REFIT_LOG_BAYES = 4.0
 """Smallest log Bayes factor, to first order, of hypotheses that are relinearised."""
 
-N_FAMILIES = 33.0
+N_FAMILIES = 34.0
 """Number of families that share the prior probability; each effect is as likely as a family."""
 
 MAX_REFITTED = 8
@@ -270,6 +271,7 @@ def list_families(model: LinearModel, rows: Rows, *, grouped: bool) -> Iterator[
     yield from swapped_rows(rows)
     yield from row_offsets(rows)
     yield from changes_between_sessions(model)
+    yield from lost_steps(model, rows)
 
 
 def _is_paired(family: Family) -> bool:

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.hypotheses.anomaly import Explanation
@@ -99,10 +98,10 @@ class Patterns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineShift:
-    """Difference of the machine's errors in some of the sessions."""
+    """Difference of the machine's errors in some of the readings."""
 
-    sessions: NDArray[np.bool_]
-    """Mask of sessions in which the machine differs, shape (n_sessions,)."""
+    entries: Mask
+    """Mask of entries that the differing machine shows, shape (n_entries,)."""
     direction: Array
     """Difference of the free parameters, shape (n_free,), [prior std]; per unit of an unknown
     amount."""
@@ -147,7 +146,7 @@ class Family:
     - a change of rows by known amounts (`edits`), an effect of unknown amount (`effects`), or both;
     - several effects with independent amounts (`groups`), or those of a machine (`systematic`);
     - rows without information (`silent`);
-    - a change of the machine between sessions (`shifts`), by a known or an unknown amount.
+    - a change of the machine between readings (`shifts`), by a known or an unknown amount.
     """
 
     explain: Callable[[int], Explanation]

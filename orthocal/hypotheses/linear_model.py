@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
@@ -30,6 +30,9 @@ from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
 from orthocal.session.session import Session, split_label
 from orthocal.statistics.zeros import project_out_zeros
+
+MAX_JACOBIAN = 2_000_000
+"""Largest size of the Jacobian of a single session in which drives may lose steps."""
 
 CACHE_SIZE = 6
 """Number of cached models, and of cached most likely machines."""
@@ -125,7 +128,8 @@ class LinearModel:
             return self.linearise(theta, (), about.passive, keep_jacobian=keep_jacobian)
         if keep_jacobian:
             return about
-        return replace(about, jacobian=np.empty((len(about.jacobian), 0)))
+        none = np.empty((len(about.jacobian), 0))
+        return replace(about, jacobian=none, complete_jacobian=none)
 
     def _find_hidden(self, about: ModelLinearisation) -> Indices:
         """Indices of nuisance parameters that change readings at one prior std, but not at 0."""
@@ -170,6 +174,20 @@ class LinearModel:
         setup_of_entry = self.problem.observations.setup
         first_entries = [np.argmax(self.session_of_entry == k) for k in range(len(self.labels))]
         return np.array([by_setup[setup_of_entry[i]] for i in first_entries])
+
+    @cached_property
+    def has_shifts(self) -> bool:
+        """True if the machine may differ between readings, which needs their Jacobian.
+
+        In a large single session it may not, because that would take much memory.
+        """
+        small = self.problem.observations.size * self.problem.n_free <= MAX_JACOBIAN
+        several = len(self.labels) > 1 or bool(self.compensated.any())
+        return several or (small and bool(self.offsets))
+
+    def entries_of(self, sessions: Mask) -> Mask:
+        """Mask of the entries of sessions, shape (n_entries,), from their mask, (n_sessions,)."""
+        return np.asarray(sessions[self.session_of_entry])
 
     @property
     def order(self) -> Indices:
@@ -241,7 +259,7 @@ class LinearModel:
 
         Args:
             theta: Errors minus those of the reference, shape (n_free,), [prior std].
-            shifts: Known differences of the machine in some of the sessions.
+            shifts: Known differences of the machine in some of the readings.
             start: Passive coordinates to start from, shape (n_states, n_passive), [m, rad].
             keep_jacobian: Whether the result includes the Jacobian.
 
@@ -249,10 +267,10 @@ class LinearModel:
             ClosureError: If the machine cannot reach a posture.
             SessionError: If a predicted reading is not finite.
         """
-        machines, of_session = self._machines(theta, shifts)
+        machines, of_entry = self._machines(theta, shifts)
         starts = None if start is None else np.broadcast_to(start, (len(machines), *start.shape))
         return self._assemble(
-            theta, of_session, *self._predict(machines, starts), keep_jacobian=keep_jacobian
+            theta, of_entry, *self._predict(machines, starts), keep_jacobian=keep_jacobian
         )
 
     def linearise_all(
@@ -295,35 +313,31 @@ class LinearModel:
         if len(points) > 1:
             with suppress(ClosureError, np.linalg.LinAlgError):
                 predictions = self._predict(distinct, starts)
-        for point, (thetas, of_session), m in zip(points, machines, places, strict=True):
+        for point, (thetas, of_entry), m in zip(points, machines, places, strict=True):
             try:
                 predicted = (
                     self._predict(thetas, starts[m])
                     if predictions is None
                     else [values[m] for values in predictions]
                 )
-                yield self._assemble(
-                    point.theta, of_session, *predicted, keep_jacobian=keep_jacobian
-                )
+                yield self._assemble(point.theta, of_entry, *predicted, keep_jacobian=keep_jacobian)
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 yield None
 
     def _machines(self, theta: Array, shifts: Sequence[MachineShift]) -> tuple[Array, Indices]:
-        """Errors of distinct machines and the machine of each session.
+        """Errors of distinct machines and the machine of each entry.
 
         Returns:
-            Free parameters of M machines, shape (M, n_free), [SI], and the machine of each session,
-            shape (n_sessions,).
+            Free parameters of M machines, shape (M, n_free), [SI], and the machine of each entry,
+            shape (n_entries,).
         """
-        session_shifts = [
-            sum((s.direction for s in shifts if s.sessions[k]), np.zeros_like(theta))
-            for k in range(len(self.labels))
-        ]
-        distinct = {shift.tobytes(): shift for shift in session_shifts}
-        place = {key: m for m, key in enumerate(distinct)}
-        errors = (theta + np.array(list(distinct.values()))) * self.problem.theta_scale
-        of_session = np.array([place[s.tobytes()] for s in session_shifts])
-        return self.reference + errors, of_session
+        if not shifts:
+            machine_of_entry = np.zeros(self.session_of_entry.size, dtype=np.int64)
+            return (self.reference + theta * self.problem.theta_scale)[None], machine_of_entry
+        shifted = np.column_stack([s.entries for s in shifts])
+        combinations, machine_of_entry = np.unique(shifted, axis=0, return_inverse=True)
+        errors = theta + combinations @ np.array([s.direction for s in shifts])
+        return self.reference + errors * self.problem.theta_scale, machine_of_entry.reshape(-1)
 
     def _predict(self, machines: Array, starts: Array | None) -> tuple[Array, Array, Array]:
         """Predicted entries, their Jacobians and the passive coordinates of machines.
@@ -341,29 +355,30 @@ class LinearModel:
     def _assemble(
         self,
         theta: Array,
-        of_session: Indices,
+        machine: Indices,
         readings: Array,
         jacobians: Array,
         passive: Array,
         *,
         keep_jacobian: bool,
     ) -> ModelLinearisation:
-        """Linearisation from the predictions of the machine of each session.
+        """Linearisation from the predictions of the machine of each entry.
 
         Raises:
             SessionError: If a predicted reading is not finite.
         """
-        o, machine = self.problem.observations, of_session[self.session_of_entry]
+        o = self.problem.observations
         entry = np.arange(o.size)
-        expected, jacobian = readings[machine, entry], jacobians[machine, entry]
-        require_finite(self.problem, expected, jacobian)
-        jacobian = project_out_zeros(jacobian, o)
+        expected, complete = readings[machine, entry], jacobians[machine, entry]
+        require_finite(self.problem, expected, complete)
+        jacobian, none = project_out_zeros(complete, o), np.empty((o.size, 0))
         likelihood, error_directions, singular_values = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
         )
         return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
-            jacobian if keep_jacobian else np.empty((o.size, 0)),
+            jacobian if keep_jacobian else none,
+            complete if keep_jacobian else none,
             likelihood,
             error_directions,
             singular_values,
@@ -503,8 +518,8 @@ class LinearModel:
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
-        change = np.asarray(about.jacobian @ shift.direction)
-        change = np.where(shift.sessions[self.session_of_entry], change, 0.0)
+        change = np.asarray(about.complete_jacobian @ shift.direction)
+        change = np.where(shift.entries, change, 0.0)
         return np.asarray(self.project(change[None])[0])
 
     def products(

@@ -17,7 +17,7 @@ from orthocal.statistics.distributions import log_positive_share
 class ModelLinearisation:
     """Linearised model about one machine, gauge zeros projected out.
 
-    The machine of each session may differ by known errors (`shifts`).
+    The machine of some readings may differ by known errors (`shifts`).
     """
 
     expected: Array
@@ -25,6 +25,8 @@ class ModelLinearisation:
     jacobian: Array
     """Jacobian ∂h per prior std of each error, shape (n_entries, n_free), [m]; shape (n_entries, 0)
     if not requested."""
+    complete_jacobian: Array
+    """The Jacobian before the gauge zeros are projected out, of the same shape, [m]."""
     likelihood: Likelihood
     error_directions: Array
     """Errors per principal direction, shape (n_free, r), [prior std]."""
@@ -89,6 +91,6 @@ class LinearisationPoint:
     theta: Array
     """Errors minus those of the reference, shape (n_free,), [prior std]."""
     shifts: Sequence[MachineShift]
-    """Known differences of the machine in some of the sessions."""
+    """Known differences of the machine in some of the readings."""
     start: Array
     """Passive coordinates to start from, shape (n_states, n_passive), [m, rad]."""

@@ -232,7 +232,8 @@ class _Search:
         for family, _ in scored:
             for h in range(len(family.shifts) if not family.known else 0):
                 e = family.explain(h)
-                if e.drives and (e.drives, e.sessions) not in present:
+                lost = e.kind == "lost steps"
+                if e.drives and not lost and (e.drives, e.sessions) not in present:
                     by_sessions.setdefault(e.sessions, []).append(self.scorer.term(family, h))
         for terms in by_sessions.values():
             if len(terms) <= MAX_DRIVES:

@@ -54,8 +54,7 @@ class SetEvaluator:
 
     def __init__(self, model: LinearModel, values: Array) -> None:
         self.model, self.values = model, values
-        self._keep_jacobian = len(model.labels) > 1 or bool(model.compensated.any())
-        self.reference = model.at_reference(keep_jacobian=self._keep_jacobian)
+        self.reference = model.at_reference(keep_jacobian=model.has_shifts)
         self.sound = self.evaluate((), self.reference)
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
@@ -78,7 +77,7 @@ class SetEvaluator:
             points = [self._next_point(states[-1], first=k == 0) for states in unfinished]
             steps = [(t, p) for t, p in zip(unfinished, points, strict=True) if p is not None]
             abouts = self.model.linearise_all(
-                [p for _, p in steps], keep_jacobian=self._keep_jacobian
+                [p for _, p in steps], keep_jacobian=self.model.has_shifts
             )
             unfinished = []
             for (states, _), about in zip(steps, abouts, strict=True):

@@ -195,12 +195,14 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
             if drive.name in e.drives:
                 numbers[f"{drive.name}_active_{drive.edge_unit}"] = active * drive.edge_factor
     names = e.drives or e.parameters
-    file = _file_of(session, e.sessions[0]) if e.sessions else None
+    place = Place(file=_file_of(session, e.sessions[0]) if e.sessions else None)
+    if e.first is not None:
+        place = place_of(session, e.first)
     return review(
         e.kind,
         text,
         _session_remedy(session, e),
-        tuple(Place(file=file, parameter=name) for name in names) or (Place(file=file),),
+        tuple(replace(place, parameter=name) for name in names) or (place,),
         **numbers,
     )
 
@@ -221,11 +223,11 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
         )
     changes = joined([f"{plain(size)} {unit}" for unit, size in sizes.items()], "or")
     text = (
-        f"No change between the sessions. A change of one offset by {changes} would have been "
-        "detected."
+        f"No change between the sessions was found. One offset that changed by {changes} between "
+        "them would have been detected."
     )
     if undetectable:
-        text += f" A change of {joined(tuple(undetectable), 'or')} would not."
+        text += f" A change of {joined(tuple(undetectable), 'or')} would not have been."
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
@@ -403,6 +405,7 @@ def _text(session: Session, e: Explanation) -> str:
             f"{mm(e.amount or 0.0)} mm: {_amounts(e)}"
         ),
         "machine changed": lambda: _changed(session, e),
+        "lost steps": lambda: _lost_steps(session, e),
         "offset of one drive": lambda: _other_offset(session, e),
         "offsets not entered": lambda: _entered(e, "not entered"),
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
@@ -564,6 +567,18 @@ def _changed(session: Session, e: Explanation) -> str:
     return f"the machine changed: {what} {verb}{_amount_of_change(session, e)} {when}"
 
 
+def _lost_steps(session: Session, e: Explanation) -> str:
+    """Clause about a drive whose offset differs from some reading on."""
+    reading = session.readings[e.first or 0]
+    line = "" if reading.line is None else f"line {reading.line}, "
+    of_session = f" of session {e.sessions[0]}" if e.sessions else ""
+    return (
+        f"drive {joined(e.drives)} lost steps or slipped, at about {line}"
+        f"{_row(session, e.first or 0)}: it moved{_amount_of_change(session, e)}, and later "
+        f"readings{of_session} do not fit the earlier ones"
+    )
+
+
 def _amount_of_change(session: Session, e: Explanation) -> str:
     """Amount of a change with its limits, such as " by +0.100 ± 0.020 mm"; "" if unknown."""
     if e.amount is None or not e.parameters:
@@ -705,6 +720,11 @@ def _session_remedy(session: Session, e: Explanation) -> str:
         return (
             "Calibrate the last log alone and export its settings: they must belong to the present "
             "printer."
+        )
+    if e.kind == "lost steps":
+        return (
+            "Home the machine, go to the first posture of a setup and read it again. If it has "
+            f"changed, look for the cause at {joined(e.drives)}, and measure the session again."
         )
     if e.kind != "machine changed":
         number = "backlash" if e.kind.startswith("backlash") else "offsets"

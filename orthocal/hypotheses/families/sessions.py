@@ -77,7 +77,7 @@ def _of_controller(
             )
             direction = np.zeros(model.problem.n_free)
             direction[place] = (stated[k] - active) / model.problem.theta_scale[place]
-            shifts.append(MachineShift(np.arange(len(model.labels)) == k, direction))
+            shifts.append(MachineShift(model.session_of_entry == k, direction))
     if explanations:
         yield Family.of(explanations, shifts=shifts)
 
@@ -200,7 +200,7 @@ def _steps(
                     apart=apart,
                 )
             )
-            shifts.append(MachineShift(sessions, direction))
+            shifts.append(MachineShift(model.entries_of(sessions), direction))
     return Family.of(explanations, shifts=shifts, known=False)
 
 
@@ -253,7 +253,7 @@ def detectable_changes(session: Session) -> dict[str, float]:
     for drive, i in offsets.items():
         direction = np.zeros(problem.n_free)
         direction[i] = 1.0 / problem.theta_scale[i]
-        shifts = [MachineShift(later, direction) for later in steps]
+        shifts = [MachineShift(model.entries_of(later), direction) for later in steps]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
         _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
         changes[drive] = DETECTABLE_CHANGE * float(stds.max())
