@@ -611,12 +611,13 @@ def test_side_of_approach_is_asked_for_if_the_plan_states_none(folder, run):
 
 def test_a_wrong_side_is_shown_as_it_was_typed(folder, run):
     with_effects(folder, "backlash")
-    _, out, _ = run(folder, "side q", "side pq")
+    _, out, _ = run(folder, "side q", "side pq", "side ↑↓↑")
     text = " ".join(out.split())
+    assert "expected 3 letters ('pnp' for these arrows), one for each drive" in text
     expected = "expected 3 letters, one for each drive (x_slide, y_slide, z_slide): p if"
     for typed in ("q", "pq"):
         assert f"Not recorded: the side is '{typed}'; {expected}" in text
-    assert text.count("u if unknown; or one of these letters for all drives") == 2
+    assert text.count("u if unknown; or one of these letters for all drives") == 3
 
 
 def test_a_planned_side_of_approach_stays(folder, run):

@@ -468,9 +468,9 @@ def _report(folder: Path, design: _Design) -> None:
     from orthocal.output.text.accuracy import describe_gains
     from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import (
+        describe_absent,
         describe_expected,
         describe_size,
-        describe_unusable,
         show_duration,
     )
 
@@ -484,7 +484,7 @@ def _report(folder: Path, design: _Design) -> None:
     if plan is not None and not isinstance(plan, orthocal.MeasuringPlan):
         lines += [BED_WORDS, *describe_gains(plan.find_sensor_gains(), plan.expected.reported.rms)]
     if isinstance(plan, orthocal.MeasuringPlan):
-        lines += describe_unusable(plan)
+        lines += describe_absent(plan)
     programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
         f"Wrote {folder}: {design.machine.words}.",

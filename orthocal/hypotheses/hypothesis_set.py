@@ -61,9 +61,18 @@ class HypothesisSet:
         return self.score.log_likelihood + sum(t.prior for t in self.terms)
 
     @property
-    def size(self) -> tuple[int, int]:
-        """Numbers of hypotheses and of rows concerned; a simpler set has a smaller size."""
-        return len(self.terms), sum(len(t.explanation.rows) for t in self.terms)
+    def size(self) -> tuple[int, int, int]:
+        """Numbers of hypotheses, of rows and of drives; a simpler set has a smaller size.
+
+        A mistake in entering the numbers of all drives is simpler than one of some of them, and
+        that is simpler than an unknown number.
+        """
+        explanations = [t.explanation for t in self.terms]
+        drives = [
+            0 if len(e.drives) == len(e.active) else len(e.drives) + (not e.active)
+            for e in explanations
+        ]
+        return len(self.terms), sum(len(e.rows) for e in explanations), sum(drives)
 
 
 def negative_log_posterior(state: HypothesisSet) -> float:

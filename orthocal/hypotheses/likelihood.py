@@ -245,6 +245,8 @@ class Likelihood:
     def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:
         """Score with the amounts of the most likely pair (e, s).
 
+        Their standard deviations are averaged over all pairs, because both scales are uncertain.
+
         Args:
             logs: Log evidence at each pair, shape (g,).
             amounts: Estimated amounts, shape (g, k).
@@ -252,12 +254,16 @@ class Likelihood:
         """
         best = int(np.argmax(logs))
         e, s = divmod(best, NOISE_SCALES.size)
+        total = log_of_sum(logs)
+        probability = np.exp(logs - total)[:, None]
+        variances = np.diagonal(np.linalg.inv(gram), axis1=1, axis2=2)
+        spread = variances + (amounts - amounts[best]) ** 2
         return Score(
-            float(log_of_sum(logs)),
+            float(total),
             float(SCALE_NODES[e]),
             float(NOISE_SCALES[s]),
             amounts[best],
-            np.sqrt(np.diag(np.linalg.inv(gram[best]))),
+            np.sqrt((probability * spread).sum(axis=0)),
         )
 
     def _gram(

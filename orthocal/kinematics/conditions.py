@@ -215,10 +215,23 @@ def find_approach_problem(text: str, robot: Robot) -> str:
     if len(text) == len(robot.drives) and not text.strip("".join(APPROACH)):
         return ""
     drives = ", ".join(d.name for d in robot.drives)
+    meant = _letters_of_arrows(text, robot)
+    meant = f" ('{meant}' for these arrows)" if meant else ""
     return (
-        f"'{shorten(text)}'; expected {len(robot.drives)} letters, one for each drive ({drives}): "
-        "p if its coordinate grew in its last motion, n if it fell, u if unknown"
+        f"'{shorten(text)}'; expected {len(robot.drives)} letters{meant}, one for each drive "
+        f"({drives}): p if its coordinate grew in its last motion, n if it fell, u if unknown"
     )
+
+
+def _letters_of_arrows(text: str, robot: Robot) -> str:
+    """Letters of an approach that is written in the arrows of the sheet; "" for other text."""
+    signs = {"↑": 1.0, "↓": -1.0, "·": 0.0}
+    arrows = text * len(robot.drives) if len(text) == 1 else text
+    if len(arrows) != len(robot.drives) or not set(arrows) <= signs.keys():
+        return ""
+    letters = {sign: letter for letter, sign in APPROACH.items()}
+    moved = zip(arrows, robot.drives, strict=True)
+    return "".join(letters[signs[arrow] * drive.direction] for arrow, drive in moved)
 
 
 def require_range(value: float, low: float, high: float, unit: str, *, where: str) -> None:

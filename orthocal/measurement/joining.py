@@ -111,7 +111,8 @@ def _require_same_machine(sessions: Sequence[Session]) -> None:
         if session.robot.effect_names != last.robot.effect_names:
             names = (", ".join(s.robot.effect_names) or "none" for s in (session, last))
             raise SessionError(
-                "states the effects {}; another session has {}: choose them".format(*names),
+                "states the effects {}; another session has {}: state the same effects in all of "
+                "them, or choose by --effects".format(*names),
                 where=f"{session.path or 'session'}: calibration.effects",
             )
         if (session.firmware is None) != (last.firmware is None):

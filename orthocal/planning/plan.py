@@ -51,6 +51,7 @@ from orthocal.planning.timed_search import TimedSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.session.points import names_in_files
 from orthocal.session.session import Purpose, Session
 
 MODEL = "full"
@@ -113,6 +114,9 @@ class MeasuringPlan:
     """Planned readings with expected times and temperatures, joined with the existing readings."""
     unusable: Mapping[str, float] = field(default_factory=dict)
     """Gauges that the plan cannot use, with the range to either side that they would need, [m]."""
+    unchosen: Mapping[str, float] = field(default_factory=dict)
+    """Stated gauges that could be used but are not in the plan, mapped to the range to either side
+    that their readings need, [m]; to 0 if they are within their range."""
 
     def find_sensor_gains(self) -> tuple[SensorGain, ...]:
         """Gains of an hour with each usual sensor after these readings, the largest first."""
@@ -322,6 +326,26 @@ def _with_choice(
     return robot.with_tolerances(choice.tolerances), None
 
 
+def _find_unchosen(comparison: Comparison) -> dict[str, float]:
+    """Stated gauges that could be used but are not in the plan.
+
+    Returns:
+        Name to the range to either side that its readings need, if that exceeds its range, [m];
+        otherwise to 0.
+    """
+    candidates = comparison.candidates
+    planned = {names_in_files(s)[1] for s in comparison.plan.setups.values()}
+    unchosen = {}
+    for owned in comparison.equipment.owned:
+        if owned.name in planned or owned.name in candidates.unusable:
+            continue
+        limits = candidates.session.gauges[owned.name].range
+        needed = candidates.needed.get(owned.name, 0.0)
+        beyond = limits is not None and needed > 0.5 * (limits[1] - limits[0])
+        unchosen[owned.name] = needed if beyond else 0.0
+    return unchosen
+
+
 def _find_approach_parameters(candidates: Candidates, robot: Robot) -> list[int]:
     """Indices in the state of the parameters of effects that depend on the approach."""
     names = {
@@ -416,6 +440,7 @@ def _evaluate(
         further=find_further_readings(comparison, limits),
         complete=joined,
         unusable=comparison.candidates.unusable,
+        unchosen=_find_unchosen(comparison),
     )
 
 

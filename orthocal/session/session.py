@@ -194,8 +194,13 @@ class Reading:
 
     @property
     def label(self) -> str:
-        """Setup and postures in words."""
-        return f"{self.setup} {self.postures}"
+        """Setup and postures in words; in joined sessions the session is named once."""
+        return f"{self.setup} {self.within_session(self.postures)}"
+
+    def within_session(self, postures: str) -> str:
+        """Names of postures without the label of the session, which the setup has too."""
+        label, slash, _ = self.setup.partition("/")
+        return postures.replace(f"{label}/", "") if slash else postures
 
     @property
     def label_with_cycle(self) -> str:

@@ -38,7 +38,7 @@ from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
-from orthocal.output.text.plan import describe_unusable, plan_json
+from orthocal.output.text.plan import describe_absent, plan_json
 from orthocal.planning import tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
@@ -399,8 +399,25 @@ def test_a_sensor_with_too_short_a_range_is_named(owned):
     assert " ".join(last.split()).startswith("Not in the plan: bar. Within the tolerances")
     assert " ".join(last.split()).endswith(f"{remedy}, use a gauge of more range {entering}")
     active = plan.session.with_controller([1e-3, 0.0, 0.0])  # offsets are entered already
-    (words,) = describe_unusable(replace(plan, complements=True, session=active))
+    (words,) = describe_absent(replace(plan, complements=True, session=active))
     assert words.endswith(f"{remedy} or use a gauge of more range.")
+
+
+def test_a_sensor_that_gains_less_than_others_is_named(owned):
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    noisy = owned(bar=BAR.replace("sigma_mm: 0.002", "sigma_mm: 1"))
+    with few_balls(1):
+        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=noisy, **FEW), starts=1)
+    assert plan.unchosen == {"bar": 0.0}
+    title, *_, last = summarize(plan).split("\n\n")
+    assert title.endswith("min, without bar")
+    better = (
+        "Not in the plan: bar. In this time other readings reduce the expected tool error more."
+    )
+    assert " ".join(last.split()) == better
+    (words,) = describe_absent(replace(plan, unchosen={"bar": 6e-3}))
+    assert words.startswith(f"{better} Within the tolerances of machine, place and gauge many of ")
+    assert "±6.0 mm, beyond its range" in words
 
 
 @pytest.mark.parametrize("names", [("dial",), ("bar", "bar")])

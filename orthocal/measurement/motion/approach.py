@@ -104,7 +104,7 @@ def label_reading(robot: Robot, reading: Reading) -> str:
         return reading.label_with_cycle
     arrows = describe_approach(robot, reading.approach)
     cycle = f", cycle {reading.cycle}" if reading.cycle > 1 else ""
-    return f"{reading.setup} {reading.posture} {arrows}{cycle}"
+    return f"{reading.setup} {reading.within_session(reading.posture)} {arrows}{cycle}"
 
 
 def name_approach(motion: Array) -> str:

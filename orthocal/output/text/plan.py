@@ -108,7 +108,8 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     remaining = describe_remaining(plan.find_remaining()) if details else []
     gains = plan.find_sensor_gains()
     helps = _helps(plan, gains)
-    absent = f", without {joined(_unusable_names(plan))}" if plan.unusable else ""
+    names = [*_unusable_names(plan), *plan.unchosen]
+    absent = f", without {joined(names)}" if names else ""
     parts: list[RenderableType] = [
         Text(
             f"Plan for {robot.name}, model {plan.forecast.selection.label}: {describe_size(s)}, "
@@ -124,7 +125,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(_how_to_measure(plan))),
-        *([Text(), *map(Text, describe_unusable(plan))] if plan.unusable else []),
+        *([Text(), *map(Text, describe_absent(plan))] if names else []),
     ]
     return Group(*parts)
 
@@ -181,22 +182,27 @@ def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) 
     return [describe_remedy(offsets, gains, plan.expected.reported.rms)]
 
 
-def describe_unusable(plan: MeasuringPlan) -> list[str]:
-    """Gauges whose range is too small for their readings, and what to do, as sentences."""
+def describe_absent(plan: MeasuringPlan) -> list[str]:
+    """Gauges that are not in the plan, and what to do, as sentences."""
     entered = plan.complements and bool(np.any(plan.session.active_offsets))
     kinds = {sensor.name: sensor.keys["sensor"] for sensor in plan.equipment.owned}
+    unusable = dict(zip(_unusable_names(plan), plan.unusable.values(), strict=True))
     sentences = []
-    for name, needed in zip(_unusable_names(plan), plan.unusable.values(), strict=True):
+    for name, needed in {**unusable, **plan.unchosen}.items():
         keys = PLACE_TOLERANCES.get(kinds.get(name, ""), ())
         tolerances = f"tolerances ({joined(keys)})" if keys else "tolerances"
         remedies = [f"state smaller {tolerances}", "use a gauge of more range"]
         if not entered:
             remedies.append("enter offsets of other readings first and plan from their session")
-        sentences.append(
-            f"Not in the plan: {name}. Within the tolerances of machine, place and gauge its "
-            f"readings reach ±{needed / MM:.1f} mm, beyond its range. To plan with it, "
-            f"{joined(remedies, 'or')}."
+        better = " In this time other readings reduce the expected tool error more."
+        reach = (
+            f" Within the tolerances of machine, place and gauge {{}} readings reach "
+            f"±{needed / MM:.1f} mm, beyond its range. To plan with it, {joined(remedies, 'or')}."
         )
+        reason = reach.format("its") if name in unusable else better
+        if name not in unusable and needed:
+            reason = better + reach.format("many of its")
+        sentences.append(f"Not in the plan: {name}.{reason}")
     return sentences
 
 
@@ -333,6 +339,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "curve": [stage(s) for s in plan.curve],
         "enough": None if plan.enough is None else stage(plan.enough),
         "unusable_mm": {name: needed / MM for name, needed in plan.unusable.items()},
+        "unchosen_mm": {name: needed / MM for name, needed in plan.unchosen.items()},
         "effects": [asdict(e) for e in plan.effects],
         "further_readings": [asdict(f) for f in plan.further],
         "remaining": [
