@@ -380,8 +380,8 @@ def _text(session: Session, e: Explanation) -> str:
         "swapped rows": lambda: _swapped(session, e),
         "row offset": lambda: _offset(session, e),
         "stuck dial": lambda: (
-            f"the dial stuck in setup {e.names[0]}: from {_row(session, e.rows[0])} on it shows "
-            f"the same {len(e.rows)} times"
+            f"the dial stuck in setup {e.names[0]}, or a reading was written twice: from "
+            f"{_row(session, e.rows[0])} on it shows the same {len(e.rows)} times"
         ),
         "displaced gauge": lambda: _displaced(session, e),
         "displaced artefact": lambda: _displaced_artefact(session, e),
@@ -696,8 +696,13 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
         return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
     others = "" if len(rows) == 1 else ", likewise the other lines"
+    moved = ""
+    if any(r.setup != session.readings[-1].setup for r in rows):
+        moved = (
+            " If the gauge has been moved since, type `restart` there: it reads the setup again."
+        )
     return (
-        f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}. "
+        f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}.{moved} "
         f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
     )
 

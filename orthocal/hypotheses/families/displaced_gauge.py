@@ -17,8 +17,8 @@ from orthocal.sensors.protocol import equal_readings
 MIN_READINGS = 4
 """Fewest readings of a setup in which a displacement differs from an outlier."""
 
-MIN_STUCK = 3
-"""Fewest equal consecutive readings of a stuck dial."""
+MIN_STUCK = 2
+"""Fewest equal consecutive readings of a stuck dial, or of a reading that was written twice."""
 
 MAX_STUCK = 16
 """Most readings of a run of equal ones that are used."""
