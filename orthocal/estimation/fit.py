@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -261,24 +261,25 @@ def _solve_with_noise(
     """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    solution, sigma = _solve_first(program, linear, repeatability, start)
+    solution, sigma = _solve_first(program, linear, repeatability, groups, start)
     iterations, compared = solution.iterations, True
     for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
-        evaluation = _evaluate(program, solution, sigma, repeatability)
+        evaluation = _evaluate(program, solution, sigma, repeatability, groups)
         estimated = floored_sigma(evaluation.noise)
-        ratio = _estimate_noise_ratio(problem, groups, evaluation, sigma)
-        ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
-        sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
-        converged = ratio_agrees and sigma_agrees
+        several = len(groups) > 1
+        if several:
+            change = evaluation.noise_ratio / problem.noise_ratio * (estimated / sigma)
+            converged = bool(np.abs(change - 1.0).max() < SIGMA_TOLERANCE)
+        else:
+            converged = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
         if (converged and compared) or not remaining:
             break
-        if converged:  # the better sides of mirrored directions may depend on sigma
-            pass
-        elif not sigma_agrees:  # sigma first, because the ratios depend on it
+        if not converged:  # otherwise the better sides of mirrored directions may depend on sigma
             sigma = estimated
-        else:
-            problem = problem.with_noise_ratio(ratio)
+        if several and not converged:
+            problem = problem.with_noise_ratio(evaluation.noise_ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
+            repeatability = estimate_repeatability(problem.values, problem.observations)
         compared = converged or not len(problem.mirrored)
         solution = program.solve(
             sigma=sigma,
@@ -287,6 +288,8 @@ def _solve_with_noise(
             mirrored=compared,
         )
         iterations += solution.iterations
+    if len(groups) > 1:  # with the noise ratios of the solution
+        evaluation = replace(evaluation, noise=replace(evaluation.noise, sigma=sigma))
     return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
 
 
@@ -294,6 +297,7 @@ def _solve_first(
     program: Program,
     linear: LinearProblem,
     repeatability: tuple[float, int],
+    groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
 ) -> tuple[Solution, float]:
     """First solution and its sigma, [m].
@@ -301,6 +305,10 @@ def _solve_first(
     Without a start, the linearised solutions are tried, then the active offsets.
     """
     sigma, residual_sigma = _linearised_sigma(program, linear, repeatability)
+    if len(groups) > 1:  # whichever gauge is the first
+        problem = program.problem
+        initial = initial_sigmas(problem.session, problem.observations)
+        sigma = float(initial[groups[0].entries][0])
     if start is not None:
         return program.solve(sigma=sigma, start=np.asarray(start)), sigma
     sigmas = [sigma]
@@ -326,10 +334,17 @@ class _Evaluation:
     residual: Array
     at_bound: Mask
     noise: Noise
+    """Noise of the first gauge; with several gauges its sigma is from its own readings."""
+    noise_ratio: Array
+    """Noise of each entry relative to the first gauge, shape (n_entries,)."""
 
 
 def _evaluate(
-    program: Program, solution: Solution, sigma: float, repeatability: tuple[float, int]
+    program: Program,
+    solution: Solution,
+    sigma: float,
+    repeatability: tuple[float, int],
+    groups: Sequence[GaugeReadings],
 ) -> _Evaluation:
     """Predictions, Jacobian, residuals and noise at a solution."""
     problem = program.problem
@@ -338,25 +353,30 @@ def _evaluate(
     information = decompose(jacobian, problem.observations)
     residual = _residual(program, solution, prediction)
     noise = _noise(program, residual, information, sigma, repeatability, at_bound=at_bound)
-    return _Evaluation(prediction, jacobian, information, residual, at_bound, noise)
+    evaluation = _Evaluation(
+        prediction, jacobian, information, residual, at_bound, noise, problem.noise_ratio
+    )
+    if len(groups) < 2:
+        return evaluation
+    sigmas = _estimate_sigmas(problem, groups, evaluation, sigma)
+    first = float(sigmas[groups[0].entries][0])
+    return replace(evaluation, noise=replace(noise, sigma=first), noise_ratio=sigmas / first)
 
 
-def _estimate_noise_ratio(
+def _estimate_sigmas(
     problem: CalibrationProblem,
     groups: Sequence[GaugeReadings],
     evaluation: _Evaluation,
     sigma: float,
 ) -> Array:
-    """Noise of each entry relative to the first gauge, from the residuals, (n_entries,).
+    """Standard deviation of each entry from the readings of its gauge, shape (n_entries,), [m].
 
-    Multiplied by sigma, it is not below the stated noise of a gauge.
+    It is not below the stated noise of the gauge, and does not depend on the order of the gauges.
     """
-    if len(groups) < 2:
-        return problem.noise_ratio
     covariance = evaluation.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=evaluation.at_bound
     ).covariance
-    std = estimate_gauge_sigmas(
+    sigmas = estimate_gauge_sigmas(
         groups,
         problem.observations,
         residual=evaluation.residual * problem.noise_ratio,
@@ -364,10 +384,9 @@ def _estimate_noise_ratio(
         values=problem.values * problem.noise_ratio,
         sigma=sigma * problem.noise_ratio,
     )
-    ratio = std / std[groups[0].entries][0]
-    for g in groups[1:]:
-        ratio[g.entries] = np.maximum(ratio[g.entries], stated_sigma(g.gauge) / sigma)
-    return np.asarray(ratio)
+    for g in groups:
+        sigmas[g.entries] = np.maximum(sigmas[g.entries], stated_sigma(g.gauge))
+    return sigmas
 
 
 def floored_sigma(noise: Noise) -> float:
