@@ -15,6 +15,9 @@ from orthocal.hypotheses.likelihood import Score
 from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.session.session import Session
 
+MIN_LOST = 2
+"""Number of wrong readings that are as simple as lost steps."""
+
 MAX_ALTERNATIVES = 8
 """Most alternatives of an anomaly that are listed."""
 
@@ -65,14 +68,18 @@ class HypothesisSet:
         """Numbers of hypotheses, of rows and of drives; a simpler set has a smaller size.
 
         A mistake in entering the numbers of all drives is simpler than one of some of them, and
-        that is simpler than an unknown number.
+        that is simpler than an unknown number. Lost steps are less simple than one wrong reading.
         """
         explanations = [t.explanation for t in self.terms]
-        drives = [
-            0 if len(e.drives) == len(e.active) else len(e.drives) + (not e.active)
-            for e in explanations
-        ]
-        return len(self.terms), sum(len(e.rows) for e in explanations), sum(drives)
+        rows = sum(len(e.rows) if e.first is None else MIN_LOST for e in explanations)
+        return len(self.terms), rows, sum(map(_count_drives, explanations))
+
+
+def _count_drives(e: Explanation) -> int:
+    """Drives with wrong numbers: 0 if all drives have them, 2 if the number is unknown."""
+    if e.active:
+        return 0 if len(e.drives) == len(e.active) else len(e.drives)
+    return 2 if e.parameters and not e.rows else 0
 
 
 def negative_log_posterior(state: HypothesisSet) -> float:

@@ -45,6 +45,7 @@ from orthocal.hypotheses.hypothesis_set import (
 )
 from orthocal.hypotheses.likelihood import log_of_sum
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
+from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
 from orthocal.hypotheses.set_evaluation import SetEvaluator
 from orthocal.session.session import Session
 
@@ -59,6 +60,9 @@ MAX_ANOMALIES = 4
 MAX_COMBINED = 5
 """Number of the most likely single hypotheses that are combined in pairs if none of them alone
 makes the readings plausible."""
+
+MIN_GAIN = 0.1
+"""Smallest gain of log posterior by which another machine fits readings without anomaly better."""
 
 LARGEST_TOLERANCE_SCALE = 5.0
 """Upper limit of the tolerance scale of a plausible machine."""
@@ -153,6 +157,11 @@ class _Search:
             if extended is None:
                 break
             state = self._eliminate(extended)
+            if not state.terms:  # about a machine that fits better
+                if state.log_posterior < self.sound.log_posterior + MIN_GAIN:
+                    break
+                self.sound = state
+                continue
             near += [(extended, s) for s in alternatives]
             if alternatives and not is_local(self.session, state, alternatives):
                 break
@@ -267,16 +276,33 @@ class _Search:
         return score.tolerance_scale < LARGEST_TOLERANCE_SCALE and quiet
 
     def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
-        """Remove hypotheses that the others make superfluous."""
-        while len(state.terms) > 1:
+        """Remove hypotheses that the others make superfluous.
+
+        The remaining ones are also linearised about the machine of all of them: errors of some mm
+        may end at a worse machine without a hypothesis that only leads away from it.
+        """
+        while state.terms:
             sets = [[t for t in state.terms if t is not removed] for removed in state.terms]
             needed = [min(SIMILAR_LOG_BAYES, _needed(removed)) for removed in state.terms]
-            reduced = zip(needed, self.sets.evaluate_all(sets, self.sound.about), strict=True)
+            starts = self.sound.about, self._without_shifts(state)
+            evaluated = [self.sets.evaluate_all(sets, about) for about in starts]
+            better = [
+                max(pair, key=lambda s: s.log_posterior) for pair in zip(*evaluated, strict=True)
+            ]
+            reduced = zip(needed, better, strict=True)
             needed_gain, best = max(reduced, key=lambda pair: pair[1].log_posterior)
             if best.log_posterior < state.log_posterior - needed_gain:
                 break
             state = best
         return state
+
+    def _without_shifts(self, state: HypothesisSet) -> ModelLinearisation:
+        """Linearisation about the machine of a state, without differences between readings."""
+        if not any(t.shift for t in state.terms):
+            return state.about
+        point = LinearisationPoint(state.about.theta, (), state.about.passive)
+        (about,) = self.model.linearise_all([point], keep_jacobian=self.model.has_shifts)
+        return about or self.sound.about
 
     def _expected(self, state: HypothesisSet, row: int) -> float:
         """Prediction of a row from all other corrected rows, as in a recording, [m]."""
