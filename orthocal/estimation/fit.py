@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -261,25 +261,24 @@ def _solve_with_noise(
     """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    solution, sigma = _solve_first(program, linear, repeatability, groups, start)
+    solution, sigma = _solve_first(program, linear, repeatability, start)
     iterations, compared = solution.iterations, True
     for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
-        evaluation = _evaluate(program, solution, sigma, repeatability, groups)
+        evaluation = _evaluate(program, solution, sigma, repeatability)
         estimated = floored_sigma(evaluation.noise)
-        several = len(groups) > 1
-        if several:
-            change = evaluation.noise_ratio / problem.noise_ratio * (estimated / sigma)
-            converged = bool(np.abs(change - 1.0).max() < SIGMA_TOLERANCE)
-        else:
-            converged = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
+        ratio = _estimate_noise_ratio(problem, groups, evaluation, sigma)
+        ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
+        sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
+        converged = ratio_agrees and sigma_agrees
         if (converged and compared) or not remaining:
             break
-        if not converged:  # otherwise the better sides of mirrored directions may depend on sigma
+        if converged:  # the better sides of mirrored directions may depend on sigma
+            pass
+        elif not sigma_agrees:  # sigma first, because the ratios depend on it
             sigma = estimated
-        if several and not converged:
-            problem = problem.with_noise_ratio(evaluation.noise_ratio)
+        else:
+            problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
-            repeatability = estimate_repeatability(problem.values, problem.observations)
         compared = converged or not len(problem.mirrored)
         solution = program.solve(
             sigma=sigma,
@@ -288,8 +287,6 @@ def _solve_with_noise(
             mirrored=compared,
         )
         iterations += solution.iterations
-    if len(groups) > 1:  # with the noise ratios of the solution
-        evaluation = replace(evaluation, noise=replace(evaluation.noise, sigma=sigma))
     return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
 
 
@@ -297,7 +294,6 @@ def _solve_first(
     program: Program,
     linear: LinearProblem,
     repeatability: tuple[float, int],
-    groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
 ) -> tuple[Solution, float]:
     """First solution and its sigma, [m].
@@ -305,10 +301,6 @@ def _solve_first(
     Without a start, the linearised solutions are tried, then the active offsets.
     """
     sigma, residual_sigma = _linearised_sigma(program, linear, repeatability)
-    if len(groups) > 1:  # whichever gauge is the first
-        problem = program.problem
-        initial = initial_sigmas(problem.session, problem.observations)
-        sigma = float(initial[groups[0].entries][0])
     if start is not None:
         return program.solve(sigma=sigma, start=np.asarray(start)), sigma
     sigmas = [sigma]
@@ -334,17 +326,10 @@ class _Evaluation:
     residual: Array
     at_bound: Mask
     noise: Noise
-    """Noise of the first gauge; with several gauges its sigma is from its own readings."""
-    noise_ratio: Array
-    """Noise of each entry relative to the first gauge, shape (n_entries,)."""
 
 
 def _evaluate(
-    program: Program,
-    solution: Solution,
-    sigma: float,
-    repeatability: tuple[float, int],
-    groups: Sequence[GaugeReadings],
+    program: Program, solution: Solution, sigma: float, repeatability: tuple[float, int]
 ) -> _Evaluation:
     """Predictions, Jacobian, residuals and noise at a solution."""
     problem = program.problem
@@ -353,30 +338,25 @@ def _evaluate(
     information = decompose(jacobian, problem.observations)
     residual = _residual(program, solution, prediction)
     noise = _noise(program, residual, information, sigma, repeatability, at_bound=at_bound)
-    evaluation = _Evaluation(
-        prediction, jacobian, information, residual, at_bound, noise, problem.noise_ratio
-    )
-    if len(groups) < 2:
-        return evaluation
-    sigmas = _estimate_sigmas(problem, groups, evaluation, sigma)
-    first = float(sigmas[groups[0].entries][0])
-    return replace(evaluation, noise=replace(noise, sigma=first), noise_ratio=sigmas / first)
+    return _Evaluation(prediction, jacobian, information, residual, at_bound, noise)
 
 
-def _estimate_sigmas(
+def _estimate_noise_ratio(
     problem: CalibrationProblem,
     groups: Sequence[GaugeReadings],
     evaluation: _Evaluation,
     sigma: float,
 ) -> Array:
-    """Standard deviation of each entry from the readings of its gauge, shape (n_entries,), [m].
+    """Noise of each entry relative to the first gauge, from the residuals, (n_entries,).
 
-    It is not below the stated noise of the gauge, and does not depend on the order of the gauges.
+    Multiplied by sigma, it is not below the stated noise of a gauge.
     """
+    if len(groups) < 2:
+        return problem.noise_ratio
     covariance = evaluation.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=evaluation.at_bound
     ).covariance
-    sigmas = estimate_gauge_sigmas(
+    std = estimate_gauge_sigmas(
         groups,
         problem.observations,
         residual=evaluation.residual * problem.noise_ratio,
@@ -384,9 +364,10 @@ def _estimate_sigmas(
         values=problem.values * problem.noise_ratio,
         sigma=sigma * problem.noise_ratio,
     )
-    for g in groups:
-        sigmas[g.entries] = np.maximum(sigmas[g.entries], stated_sigma(g.gauge))
-    return sigmas
+    ratio = std / std[groups[0].entries][0]
+    for g in groups[1:]:
+        ratio[g.entries] = np.maximum(ratio[g.entries], stated_sigma(g.gauge) / sigma)
+    return np.asarray(ratio)
 
 
 def floored_sigma(noise: Noise) -> float:

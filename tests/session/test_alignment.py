@@ -7,23 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from calibrated import calibrated, plan_of, session_of
+from calibrated import calibrated, session_of
 
 from orthocal import (
     SessionError,
     assess_tool,
-    draw_errors,
     join_sessions,
     load_calibration,
     load_session,
     restore_session,
-    simulate_session,
     write_calibration,
     write_session,
 )
 from orthocal.calibration.identify import identify
-from orthocal.estimation.tolerance_scale import AS_STATED
-from orthocal.session.session import Gauge
 
 QUICK = {"solver": "variable-projection"}
 ORDER = {"reversed": lambda n: np.arange(n)[::-1], "shuffled": np.random.default_rng(5).permutation}
@@ -67,35 +63,6 @@ def test_the_order_of_rows_changes_no_estimate(order, workshop, calibration):
     assert tools[1].after.sizes.reported.rms == pytest.approx(
         tools[0].after.sizes.reported.rms, rel=1e-9
     )
-
-
-def test_the_order_of_gauges_changes_no_estimate():
-    """The first gauge is the unit of all weights, also where repeated readings scatter more."""
-    plan = plan_of("raw-cycles")
-    gauges = {"dial": Gauge(5e-6, 1e-5), "fine": Gauge(2e-6, 1e-6)}
-    setups = {
-        name: replace(setup, gauge=("dial", "fine")[i % 2])
-        for i, (name, setup) in enumerate(plan.setups.items())
-    }
-    plan = replace(plan, gauges=gauges, setups=setups)
-    errors = draw_errors(plan.robot, plan.robot.parameters.select_model("full"), seed=4)
-    session = simulate_session(plan, errors, seed=4).session
-    steps = np.array([5e-6 if setups[r.setup].gauge == "fine" else 0.0 for r in session.readings])
-    cycle = np.array([r.cycle == 2 for r in session.readings])
-    session = session.with_values(session.values + steps * cycle)  # more than the stated noise
-    other = replace(
-        session,
-        gauges=dict(reversed(gauges.items())),
-        setups=dict(reversed(session.setups.items())),
-        readings=session.readings[::-1],
-    )
-    found = [
-        identify(s, "full", find_scale=lambda _: AS_STATED, **QUICK)[0] for s in (session, other)
-    ]
-    noise = [{g.name: g.noise for g in c.gauges} for c in found]
-    assert noise[1] == pytest.approx(noise[0], rel=1e-9)
-    values = [{p.name: p.value / p.prior_std for p in c.free} for c in found]
-    assert values[1] == pytest.approx(values[0], abs=1e-9)
 
 
 def test_the_mechanical_zero_is_the_default_where_it_is_read(workshop):
