@@ -121,7 +121,7 @@ def compute_backlash(
         uncertainty = expanded_uncertainty(calibration, entry)
         entries.append(entry)
         changes.append(_backlash_change(entry))
-        determined.append(abs(value - active_backlash) > uncertainty)
+        determined.append(max(value, abs(value - active_backlash)) > uncertainty)
     entering = _choose_changes(calibration, tool, changes, determined)
     return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 

@@ -14,6 +14,10 @@ from orthocal.hypotheses.linear_model import LinearModel
 MIN_READINGS = 4
 """Fewest readings of a session before and after a loss; wrong readings explain fewer."""
 
+LOG_PROBABILITY = -3.0
+"""Logarithm of the prior probability relative to other families. Drives lose steps more rarely than
+a gauge is displaced, which looks the same in the last setup."""
+
 MAX_SCORED = 2_000_000
 """Most readings of all hypotheses together. In larger sessions fewer readings are considered."""
 
@@ -54,7 +58,8 @@ def lost_steps(model: LinearModel, rows: Rows) -> Iterator[Family]:
                 )
                 shifts.append(MachineShift(entries, direction))
     if explanations:
-        yield Family.of(explanations, shifts=shifts, known=False)
+        rarity = np.full(len(shifts), LOG_PROBABILITY)
+        yield Family.of(explanations, shifts=shifts, known=False, log_volume=rarity)
 
 
 def _first_readings(rows: Indices, size: int) -> Indices:
