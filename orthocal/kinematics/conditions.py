@@ -20,6 +20,9 @@ from orthocal.text import shorten
 APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
 """Letters of an approach, mapped to the direction of the drive's last motion."""
 
+ARROWS = {1.0: "↑", -1.0: "↓", 0.0: "·"}
+"""Arrows by the direction in which the displayed number of a joint moves."""
+
 UseCondition = Literal["approach", "temperature", "payload"]
 """Field of `UseConditions`."""
 
@@ -225,7 +228,7 @@ def find_approach_problem(text: str, robot: Robot) -> str:
 
 def _letters_of_arrows(text: str, robot: Robot) -> str:
     """Letters of an approach that is written in the arrows of the sheet; "" for other text."""
-    signs = {"↑": 1.0, "↓": -1.0, "·": 0.0}
+    signs = {arrow: sign for sign, arrow in ARROWS.items()}
     arrows = text * len(robot.drives) if len(text) == 1 else text
     if len(arrows) != len(robot.drives) or not set(arrows) <= signs.keys():
         return ""

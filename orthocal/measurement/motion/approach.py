@@ -14,6 +14,7 @@ import numpy as np
 from orthocal.arrays import Array, Mask
 from orthocal.effects.loading import robot_effects
 from orthocal.kinematics.conditions import APPROACH as SIGN_OF_LETTER
+from orthocal.kinematics.conditions import ARROWS
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
@@ -37,9 +38,6 @@ LEAST_MOTION = 1e-6
 
 APPROACH_PER_BACKLASH = 2.0
 """Least length of an approach, as a multiple of the limit of the backlash."""
-
-ARROWS = {1.0: "↑", -1.0: "↓", 0.0: "·"}
-"""Arrows by the sign of the change of a joint's displayed number."""
 
 
 def usual_approaches(robot: Robot) -> tuple[str, ...]:

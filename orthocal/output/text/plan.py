@@ -194,15 +194,17 @@ def describe_absent(plan: MeasuringPlan) -> list[str]:
         remedies = [f"state smaller {tolerances}", "use a gauge of more range"]
         if not entered:
             remedies.append("enter offsets of other readings first and plan from their session")
-        better = " In this time other readings reduce the expected tool error more."
-        reach = (
-            f" Within the tolerances of machine, place and gauge {{}} readings reach "
-            f"±{needed / MM:.1f} mm, beyond its range. To plan with it, {joined(remedies, 'or')}."
-        )
-        reason = reach.format("its") if name in unusable else better
-        if name not in unusable and needed:
-            reason = better + reach.format("many of its")
-        sentences.append(f"Not in the plan: {name}.{reason}")
+        better = reach = ""
+        if name not in unusable:
+            better = " In this time other readings reduce the expected tool error more."
+        if needed:
+            whose = "its" if name in unusable else "many of its"
+            reach = (
+                f" Within the tolerances of machine, place and gauge {whose} readings reach "
+                f"±{needed / MM:.1f} mm, beyond its range. To plan with it, "
+                f"{joined(remedies, 'or')}."
+            )
+        sentences.append(f"Not in the plan: {name}.{better}{reach}")
     return sentences
 
 
