@@ -12,8 +12,9 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.words import fit as words
-from orthocal.calibration.assessment_record import Finding
+from orthocal.calibration.assessment_record import Finding, FindingKind
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.records import GaugeRecord
 from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
@@ -40,6 +41,17 @@ BLADE = Tip("blade", 0.0, 1.0)
 STATED, REPEATED = "the stated noise of the gauge", "the scatter of repeated readings"
 """Sources of the noise, as noun phrases."""
 
+WORST_FIRST: tuple[FindingKind, ...] = (
+    "model error",
+    "gauge overstated",
+    "noise unknown",
+    "noise from residuals",
+    "fits",
+    "noise as stated",
+    "noise from cycles",
+)
+"""Findings about the residuals of a gauge; that of the worst gauge is reported."""
+
 
 def find_fit_findings(calibration: Calibration) -> list[Finding]:
     """All findings about a fit."""
@@ -63,9 +75,24 @@ def _redundancy(calibration: Calibration) -> list[Finding]:
 
 
 def _residuals(calibration: Calibration) -> list[Finding]:
-    """Finding about the residuals in comparison with the noise."""
-    noise, stated = calibration.noise, calibration.session.gauge_sigma
+    """Finding about the residuals in comparison with the noise, for the worst of the gauges."""
+    findings = [_residuals_of(calibration, g) for g in calibration.gauges]
+    return sorted(findings, key=lambda f: (WORST_FIRST.index(f.kind), -_excess(f)))[:1]
+
+
+def _excess(finding: Finding) -> float:
+    """Ratio of the residuals to the noise, inverse if they are too small."""
+    ratio = finding.numbers.get("ratio", 1.0)
+    return max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf
+
+
+def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
+    """Finding about the residuals of one gauge."""
+    noise, stated = gauge.noise, gauge.sigma
+    several = len(calibration.gauges) > 1
     row_noun = "a difference" if calibration.rows_are_differences else "a reading"
+    if several:
+        row_noun += f" of the gauge '{gauge.name}'"
 
     def excess(reference: float, source: str) -> Finding:
         return words.model_error(
@@ -78,25 +105,25 @@ def _residuals(calibration: Calibration) -> list[Finding]:
         )
 
     if noise.source == "unknown":
-        return [words.noise_unknown()]
+        return words.noise_unknown()
     if noise.source == "gauge":
         if calibration.redundancy > 0:
-            return [words.fits(noise.sigma, STATED)]
-        return [words.noise_as_stated(noise.sigma)]
+            return words.fits(noise.sigma, STATED)
+        return words.noise_as_stated(noise.sigma)
     if noise.source == "cycles":
         if calibration.redundancy > 0:
-            return [words.fits(noise.cycles_sigma, REPEATED)]
-        return [words.noise_from_cycles(noise.cycles_sigma)]
+            return words.fits(noise.cycles_sigma, REPEATED)
+        return words.noise_from_cycles(noise.cycles_sigma)
     if noise.cycles_dof > 0:
-        return [excess(noise.cycles_sigma, REPEATED)]
+        return excess(noise.cycles_sigma, REPEATED)
     if stated is None:
-        return [words.noise_from_residuals(calibration.sigma)]
+        return words.noise_from_residuals(noise.sigma * calibration.row_factor)
     if noise.exceeded_by_residuals(stated):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
-        return [excess(stated, f"the stated scatter of {noun}")]
+        return excess(stated, f"the stated scatter of {noun}")
     if noise.exceeds_residuals(stated):
-        return [words.gauge_overstated(noise.residual_sigma, stated)]
-    return [words.fits(noise.residual_sigma, STATED)]
+        return words.gauge_overstated(noise.residual_sigma, stated, gauge.name if several else "")
+    return words.fits(noise.residual_sigma, STATED)
 
 
 def _convergence(calibration: Calibration) -> list[Finding]:

@@ -40,7 +40,6 @@ from orthocal.estimation.diagnostics.unmodelled import (
 from orthocal.estimation.fit import Fit
 from orthocal.estimation.linear import LinearProblem, linearise_problem
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.weighting import split_by_gauge
 from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.io.fields import finite_or_none, read_only
 from orthocal.robot.model import Robot
@@ -125,10 +124,14 @@ def _separate_noise(fit: Fit) -> float | None:
     Scaled tolerances explain the residuals by unmodelled errors. Noise from the residuals would
     then count these errors twice.
     """
-    gauge, scale = fit.problem.session.gauge, fit.problem.machine_selection.tolerance_scale
+    scale = fit.problem.machine_selection.tolerance_scale
     if scale.factor == 1.0 or fit.noise.source != "residuals":
         return None
-    return fit.noise.without_residuals(gauge.sigma, gauge.resolution)[0]
+    relative = np.empty(fit.problem.observations.size)
+    for g, noise in zip(fit.groups, fit.noises.gauges, strict=True):
+        separate, _ = noise.without_residuals(g.gauge.sigma, g.gauge.resolution)
+        relative[g.entries] = separate / noise.sigma
+    return fit.noise.sigma * float(np.sqrt(np.mean(relative**2)))
 
 
 def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -> None:
@@ -336,17 +339,16 @@ def _residual_rows(
 
 def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
     """Records of the gauges with their estimated noise."""
-    problem = fit.problem
     return tuple(
         GaugeRecord(
             name=g.name,
             sigma=g.gauge.sigma,
             resolution=g.gauge.resolution,
             range=g.gauge.range,
-            noise=fit.noise.sigma * float(problem.noise_ratio[g.entries][0]),
+            noise=noise,
             readings=int(g.entries.sum()),
         )
-        for g in split_by_gauge(problem.session, problem.observations)
+        for g, noise in zip(fit.groups, fit.noises.gauges, strict=True)
     )
 
 

@@ -222,8 +222,7 @@ class Calibration(CalibrationRecord):
         scale, noise = self.tolerance_scale, self.noise
         dof = self.dof
         if scale.factor != 1.0 and self.unmodelled.names and noise.source == "residuals":
-            session = self.session
-            _, dof = noise.without_residuals(session.gauge_sigma, session.gauge_resolution)
+            dof = min(g.noise.without_residuals(g.sigma, g.resolution)[1] for g in self.gauges)
         return expanded_uncertainty(
             std, std_scatter, std_scaled, dof=dof, contrasts=scale.contrasts
         )

@@ -21,13 +21,12 @@ from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
-from orthocal.estimation.weighting import initial_sigma
+from orthocal.estimation.weighting import first_sigma, split_by_gauge, with_initial_noise
 from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.observation.observations import require_conditions
 from orthocal.session.session import Session
 from orthocal.statistics.identifiability import find_base_parameters
-from orthocal.statistics.noise import estimate_repeatability
 
 MAX_BASE_ROUNDS = 8
 
@@ -127,9 +126,8 @@ def _fit_base(
     Their number depends on the noise, and the noise on the residuals. The fit is iterated until the
     base parameters do not change.
     """
-    information = linearise_problem(problem).information
-    repeatability = estimate_repeatability(problem.values, problem.observations)
-    sigma = initial_sigma(problem.session.gauge, repeatability)
+    information = linearise_problem(with_initial_noise(problem)).information
+    sigma = first_sigma(problem, split_by_gauge(problem.session, problem.observations))
     base_names: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
         factor = information.factor[:, : problem.n_machine]

@@ -233,8 +233,8 @@ class GaugeRecord:
     """Resolution, [m]."""
     range: tuple[Number, Number] | None
     """Lowest and highest reading, [m]."""
-    noise: SizeOrNaN
-    """Estimated standard deviation of a reading, [m]; NaN if it is unknown."""
+    noise: Noise
+    """Noise of a reading of this gauge."""
     readings: Count
     """Number of readings; a difference counts as two."""
 

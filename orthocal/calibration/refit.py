@@ -106,7 +106,7 @@ def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
     problem = _repeat_problem(calibration, session, calibration.tolerance_scale)
     if not math.isfinite(calibration.noise.sigma):
         return problem
-    ratio_of_gauge = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
+    ratio_of_gauge = {g.name: g.noise.sigma / calibration.noise.sigma for g in calibration.gauges}
     ratios = np.array([ratio_of_gauge[s.gauge] for s in problem.session.setups.values()])
     return problem.with_noise_ratio(ratios[problem.observations.setup])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,12 +20,14 @@ from orthocal.estimation.solvers.program import Program, Solution, advise
 from orthocal.estimation.weighting import (
     SMALLEST_SIGMA,
     GaugeReadings,
-    estimate_gauge_sigmas,
+    NoiseEstimate,
+    Scatter,
+    first_sigma,
     initial_sigma,
     initial_sigmas,
     leverages,
     split_by_gauge,
-    stated_sigma,
+    with_initial_noise,
 )
 from orthocal.statistics.information import (
     Information,
@@ -35,7 +37,7 @@ from orthocal.statistics.information import (
     marginalise,
     require_identifiable,
 )
-from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
+from orthocal.statistics.noise import Noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
 
 SIGMA_TOLERANCE = 0.03
@@ -75,8 +77,8 @@ class Fit:
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
     """Exact solution."""
-    noise: Noise
-    """Noise of a reading."""
+    noises: NoiseEstimate
+    """Noise of a reading of each gauge."""
     prediction: Array
     """h at the solution, gauge zeros at 0, shape (n_entries,), [m of the first gauge]."""
     jacobian: Array
@@ -85,11 +87,21 @@ class Fit:
     """Information of the Jacobian."""
 
     @property
+    def groups(self) -> tuple[GaugeReadings, ...]:
+        """Entries of each gauge."""
+        return split_by_gauge(self.problem.session, self.problem.observations)
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of a reading of the first gauge (`NoiseEstimate.common`)."""
+        return self.noises.common
+
+    @property
     def sigma(self) -> float:
         """Standard deviation of a reading of the first gauge, [m]; the initial one if unknown."""
         if math.isfinite(self.noise.sigma):
             return floored_sigma(self.noise)
-        return initial_sigma(self.problem.session.gauge, (math.nan, 0))
+        return initial_sigma(self.groups[0].gauge, (math.nan, 0))
 
     @property
     def loss(self) -> Loss:
@@ -208,17 +220,16 @@ def fit_problem(
     """
     began = time.perf_counter()
     groups = split_by_gauge(problem.session, problem.observations)
-    if len(groups) > 1 and (problem.noise_ratio == 1.0).all():
-        sigmas = initial_sigmas(problem.session, problem.observations)
-        problem = problem.with_noise_ratio(sigmas / sigmas[groups[0].entries][0])
+    if (problem.noise_ratio == 1.0).all():
+        problem = with_initial_noise(problem)
     linear = linearise_problem(problem)
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
     solved = _solve_with_noise(program, linear, groups, start)
-    program, linear, noise = solved.program, solved.linear, solved.evaluation.noise
+    program, linear, noises = solved.program, solved.linear, solved.evaluation.noises
     require_assembly(program.problem, solved.solution, options=program.options)
-    sigma = floored_sigma(noise)
+    sigma = floored_sigma(noises.common)
     return Fit(
         problem=program.problem,
         program=program,
@@ -229,7 +240,7 @@ def fit_problem(
         linearisation=linear,
         linearised_theta=linear.solve(sigma=sigma if math.isfinite(sigma) else solved.sigma),
         solution=solved.solution,
-        noise=noise,
+        noises=noises,
         prediction=solved.evaluation.prediction,
         jacobian=solved.evaluation.jacobian,
         information=solved.evaluation.information,
@@ -260,25 +271,24 @@ def _solve_with_noise(
 ) -> _NoiseSolution:
     """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
-    repeatability = estimate_repeatability(problem.values, problem.observations)
-    solution, sigma = _solve_first(program, linear, repeatability, start)
+    initial = initial_sigmas(problem.session, problem.observations)
+    several = len(groups) > 1
+    solution, sigma = _solve_first(program, linear, groups, start)
     iterations, compared = solution.iterations, True
     for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
-        evaluation = _evaluate(program, solution, sigma, repeatability)
-        estimated = floored_sigma(evaluation.noise)
-        ratio = _estimate_noise_ratio(problem, groups, evaluation, sigma)
-        ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
-        sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
-        converged = ratio_agrees and sigma_agrees
+        evaluation = _evaluate(program, solution, sigma, groups, initial)
+        estimated, ratio = floored_sigma(evaluation.noises.common), evaluation.noises.ratio
+        change = estimated / sigma * (ratio / problem.noise_ratio)
+        converged = not math.isfinite(estimated) or _agrees(change)
+        converged = converged or not (several or _depends_on_sigma(program))
         if (converged and compared) or not remaining:
             break
-        if converged:  # the better sides of mirrored directions may depend on sigma
-            pass
-        elif not sigma_agrees:  # sigma first, because the ratios depend on it
+        if not converged:
             sigma = estimated
-        else:
+        if not converged and several:
             problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
+        # the better sides of mirrored directions may depend on sigma
         compared = converged or not len(problem.mirrored)
         solution = program.solve(
             sigma=sigma,
@@ -287,20 +297,23 @@ def _solve_with_noise(
             mirrored=compared,
         )
         iterations += solution.iterations
+    if several:  # the noise of each gauge is that of the solution
+        noises = evaluation.noises.with_sigmas(groups, sigma * problem.noise_ratio)
+        evaluation = replace(evaluation, noises=noises)
     return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
 
 
 def _solve_first(
     program: Program,
     linear: LinearProblem,
-    repeatability: tuple[float, int],
+    groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
 ) -> tuple[Solution, float]:
     """First solution and its sigma, [m].
 
     Without a start, the linearised solutions are tried, then the active offsets.
     """
-    sigma, residual_sigma = _linearised_sigma(program, linear, repeatability)
+    sigma, residual_sigma = _linearised_sigma(program, linear, groups)
     if start is not None:
         return program.solve(sigma=sigma, start=np.asarray(start)), sigma
     sigmas = [sigma]
@@ -325,11 +338,15 @@ class _Evaluation:
     information: Information
     residual: Array
     at_bound: Mask
-    noise: Noise
+    noises: NoiseEstimate
 
 
 def _evaluate(
-    program: Program, solution: Solution, sigma: float, repeatability: tuple[float, int]
+    program: Program,
+    solution: Solution,
+    sigma: float,
+    groups: Sequence[GaugeReadings],
+    initial: Array,
 ) -> _Evaluation:
     """Predictions, Jacobian, residuals and noise at a solution."""
     problem = program.problem
@@ -337,37 +354,9 @@ def _evaluate(
     prediction, jacobian = problem.predict_and_jacobian(solution.theta, solution.passive)
     information = decompose(jacobian, problem.observations)
     residual = _residual(program, solution, prediction)
-    noise = _noise(program, residual, information, sigma, repeatability, at_bound=at_bound)
-    return _Evaluation(prediction, jacobian, information, residual, at_bound, noise)
-
-
-def _estimate_noise_ratio(
-    problem: CalibrationProblem,
-    groups: Sequence[GaugeReadings],
-    evaluation: _Evaluation,
-    sigma: float,
-) -> Array:
-    """Noise of each entry relative to the first gauge, from the residuals, (n_entries,).
-
-    Multiplied by sigma, it is not below the stated noise of a gauge.
-    """
-    if len(groups) < 2:
-        return problem.noise_ratio
-    covariance = evaluation.information.posterior(
-        sigma=sigma, precision=problem.prior_precision, at_bound=evaluation.at_bound
-    ).covariance
-    std = estimate_gauge_sigmas(
-        groups,
-        problem.observations,
-        residual=evaluation.residual * problem.noise_ratio,
-        leverage=leverages(evaluation.jacobian, problem.observations, covariance, sigma),
-        values=problem.values * problem.noise_ratio,
-        sigma=sigma * problem.noise_ratio,
-    )
-    ratio = std / std[groups[0].entries][0]
-    for g in groups[1:]:
-        ratio[g.entries] = np.maximum(ratio[g.entries], stated_sigma(g.gauge) / sigma)
-    return np.asarray(ratio)
+    scatter = _scatter(program, (jacobian, information), residual, sigma, groups, at_bound)
+    noises = scatter.estimate(initial)
+    return _Evaluation(prediction, jacobian, information, residual, at_bound, noises)
 
 
 def floored_sigma(noise: Noise) -> float:
@@ -403,13 +392,13 @@ def _depends_on_sigma(program: Program) -> bool:
     return program.problem.has_prior or program.options.loss.robust
 
 
-def _sigma_agrees(estimated: float, sigma: float) -> bool:
-    """True if an estimate of sigma agrees with the previous one, or is unknown (NaN)."""
-    return not math.isfinite(estimated) or abs(estimated / sigma - 1.0) < SIGMA_TOLERANCE
+def _agrees(change: ArrayLike) -> bool:
+    """True if factors between estimates and previous ones are near 1."""
+    return bool(np.abs(np.asarray(change) - 1.0).max() < SIGMA_TOLERANCE)
 
 
 def _linearised_sigma(
-    program: Program, linearisation: LinearProblem, repeatability: tuple[float, int]
+    program: Program, linearisation: LinearProblem, groups: Sequence[GaugeReadings]
 ) -> tuple[float, float]:
     """Sigma of the linearised problem, [m], which usually suffices for one exact solution.
 
@@ -421,19 +410,18 @@ def _linearised_sigma(
         the initial sigma is used because of few degrees of freedom.
     """
     problem = program.problem
-    sigma = initial_sigma(problem.session.gauge, repeatability)
-    initial = sigma
+    sigma = initial = first_sigma(problem, groups)
     small_dof = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
-    use_initial = problem.session.gauge.sigma is not None and small_dof
+    use_initial = all(g.gauge.sigma is not None for g in groups) and small_dof
     for i in range(MAX_SIGMA_ROUNDS if _depends_on_sigma(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.active_theta) / problem.theta_scale
         residual = linearisation.residual - linearisation.jacobian @ change
         if i == 0:
             rejected = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
             use_initial = use_initial and not rejected
-        noise = _noise(program, residual, linearisation.information, sigma, repeatability)
-        estimated = floored_sigma(noise)
-        if _sigma_agrees(estimated, sigma):
+        linear = linearisation.jacobian, linearisation.information
+        estimated = floored_sigma(_scatter(program, linear, residual, sigma, groups).common())
+        if not math.isfinite(estimated) or _agrees(estimated / sigma):
             break
         sigma = estimated
     return (initial, sigma) if use_initial else (sigma, sigma)
@@ -478,34 +466,41 @@ def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
     return project_out_zeros(deviation, o)
 
 
-def _noise(
+def _scatter(
     program: Program,
+    linear: tuple[Array, Information],
     residual: Array,
-    information: Information,
     sigma: float,
-    repeatability: tuple[float, int],
-    *,
+    groups: Sequence[GaugeReadings],
     at_bound: Mask | None = None,
-) -> Noise:
-    """Noise of a reading from its residuals.
+) -> Scatter:
+    """Readings and residuals that show the noise.
 
     Args:
         program: The program.
+        linear: dh/dθ̂, shape (n_entries, n_free), and its information.
         residual: Residuals, zeros eliminated, shape (n_entries,), [m of the first gauge].
-        information: Information of the readings.
-        sigma: Standard deviation of a reading in the present solution, [m].
-        repeatability: Scatter of the cycles and its degrees of freedom.
+        sigma: Standard deviation of a reading of the first gauge in the present solution, [m].
+        groups: The gauges.
         at_bound: Mask of the parameters at a bound, shape (n_free,).
     """
-    problem, loss = program.problem, program.options.loss
-    dof = _residual_dof(problem, information, sigma, at_bound)
-    return estimate_noise(
-        # a wrong reading in repeated cycles would increase the noise of all readings
-        repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,
-        residual_square=loss.robust_square(residual, dof=dof, start=sigma),
-        residual_dof=dof,
-        gauge_sigma=problem.session.gauge.sigma,
-        resolution=problem.session.gauge.resolution,
+    problem, (jacobian, information) = program.problem, linear
+    o, ratio = problem.observations, problem.noise_ratio
+    posterior = information.posterior(
+        sigma=sigma, precision=problem.prior_precision, at_bound=at_bound
+    )
+    if len(groups) > 1:
+        used = leverages(jacobian, o, posterior.covariance, sigma)
+    else:  # only the sum counts
+        used = np.full(o.size, posterior.effective_parameters / o.size)
+    return Scatter(
+        groups=groups,
+        observations=o,
+        loss=program.options.loss,
+        values=problem.values * ratio,
+        residual=residual * ratio,
+        used=used,
+        sigma=sigma * ratio,
     )
 
 

@@ -1,8 +1,10 @@
-"""Noise ratios of the readings of several gauges.
+"""Noise of the readings of each gauge.
 
 The noise of each gauge is estimated from its repeated cycles, otherwise from its residuals: squared
 residuals divided by the redundancy of the group (variance components; Förstner, Ein Verfahren zur
-Schätzung von Varianz- und Kovarianzkomponenten, 1979). It is never below the stated noise.
+Schätzung von Varianz- und Kovarianzkomponenten, 1979). It is never below the stated noise. Gauges
+with too few readings share one factor of their initial noise. No estimate depends on the order of
+the gauges.
 """
 
 from __future__ import annotations
@@ -14,9 +16,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array, Mask
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.problem import CalibrationProblem
 from orthocal.observation.observations import Observations
 from orthocal.session.session import Gauge, Session
-from orthocal.statistics.noise import estimate_noise, estimate_repeatability, noise_floor
+from orthocal.statistics.noise import (
+    Noise,
+    combine_noises,
+    estimate_noise,
+    estimate_repeatability,
+    noise_floor,
+)
 from orthocal.statistics.zeros import project_out_zeros
 
 DEFAULT_SIGMA = 10e-6
@@ -26,7 +36,7 @@ SMALLEST_SIGMA = 1e-9
 """Smallest standard deviation of a reading, [m]; below it readings count as perfect."""
 
 MIN_DOF = 3.0
-"""Degrees of freedom below which residuals do not determine the noise of a gauge."""
+"""Degrees of freedom below which readings do not determine the noise of one of several gauges."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +85,27 @@ def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
     return assumed_sigma(gauge)
 
 
+def first_sigma(problem: CalibrationProblem, groups: Sequence[GaugeReadings]) -> float:
+    """Standard deviation of a reading of the first gauge before the first solution, [m].
+
+    For several gauges it is that of `initial_sigmas`.
+    """
+    if len(groups) > 1:
+        sigmas = initial_sigmas(problem.session, problem.observations)
+        return float(sigmas[groups[0].entries][0])
+    repeatability = estimate_repeatability(problem.values, problem.observations)
+    return initial_sigma(groups[0].gauge, repeatability)
+
+
+def with_initial_noise(problem: CalibrationProblem) -> CalibrationProblem:
+    """Problem with the noise ratios of several gauges before the first solution."""
+    groups = split_by_gauge(problem.session, problem.observations)
+    if len(groups) < 2:
+        return problem
+    sigmas = initial_sigmas(problem.session, problem.observations)
+    return problem.with_noise_ratio(sigmas / sigmas[groups[0].entries][0])
+
+
 def initial_sigmas(session: Session, observations: Observations) -> Array:
     """Standard deviation of each entry before the first solution, shape (n_entries,), [m].
 
@@ -91,43 +122,120 @@ def initial_sigmas(session: Session, observations: Observations) -> Array:
     return result
 
 
-def estimate_gauge_sigmas(
-    groups: Sequence[GaugeReadings],
-    observations: Observations,
-    *,
-    residual: Array,
-    leverage: Array,
-    values: Array,
-    sigma: Array,
-) -> Array:
-    """Standard deviation of each entry from the residuals of its gauge, shape (n_entries,), [m].
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseEstimate:
+    """Noise of the readings of one or several gauges."""
 
-    Args:
-        groups: The gauges.
-        observations: The entries.
-        residual: Residuals, gauge zeros eliminated, shape (n_entries,), [m].
-        leverage: Leverage of each entry, shape (n_entries,).
-        values: Readings of the entries, shape (n_entries,), [m].
-        sigma: Standard deviations in the present solution, shape (n_entries,), [m]; returned for
-            gauges with too few readings.
-    """
-    result = np.array(sigma)
-    for g in groups:
-        zeros = np.unique(observations.zero[g.entries]).size
-        dof = float(g.entries.sum() - zeros - leverage[g.entries].sum())
-        repeatability = _repeatability(values, observations, g)
-        if repeatability[1] < MIN_DOF and dof < MIN_DOF:
-            continue
-        noise = estimate_noise(
-            repeatability=repeatability,
-            residual_square=float(residual[g.entries] @ residual[g.entries]),
-            residual_dof=dof,
-            gauge_sigma=g.gauge.sigma,
-            resolution=g.gauge.resolution,
+    gauges: tuple[Noise, ...]
+    """Noise of each gauge."""
+    common: Noise
+    """Noise of the first gauge, with the degrees of freedom and residuals of all gauges."""
+    ratio: Array
+    """Noise of each entry relative to the first gauge, shape (n_entries,)."""
+
+    def with_sigmas(self, groups: Sequence[GaugeReadings], sigmas: Array) -> NoiseEstimate:
+        """The estimate with standard deviations of the entries, shape (n_entries,), [m].
+
+        An unknown noise remains unknown.
+        """
+        firsts = [float(sigmas[g.entries][0]) for g in groups]
+        return NoiseEstimate(
+            tuple(n.with_sigma(s) for n, s in zip(self.gauges, firsts, strict=True)),
+            self.common.with_sigma(firsts[0]),
+            sigmas / firsts[0],
         )
-        if math.isfinite(noise.sigma):
-            result[g.entries] = max(noise.sigma, SMALLEST_SIGMA)
-    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scatter:
+    """Readings and residuals that show the noise; all arrays have the shape (n_entries,)."""
+
+    groups: Sequence[GaugeReadings]
+    """The gauges."""
+    observations: Observations
+    """The entries."""
+    loss: Loss
+    """Cost of a residual."""
+    values: Array
+    """Readings of the entries, [m]."""
+    residual: Array
+    """Residuals, gauge zeros eliminated, [m]."""
+    used: Array
+    """Leverages, parts of the effective number of parameters."""
+    sigma: Array
+    """Standard deviations in the present solution, [m]."""
+
+    def estimate(self, initial: Array) -> NoiseEstimate:
+        """Noise of each gauge.
+
+        Args:
+            initial: Standard deviations before the first solution, shape (n_entries,), [m].
+        """
+        ones = np.ones_like(self.sigma)
+        noises = [self.pool([g], ones) for g in self.groups]
+        if len(noises) == 1:
+            return NoiseEstimate((noises[0],), noises[0], ones)
+        few = [i for i, noise in enumerate(noises) if not _is_determined(noise)]
+        if few:
+            shared = self.pool([self.groups[i] for i in few], initial)
+            if not _is_determined(shared):
+                shared = self.pool(self.groups, initial)
+            for i in few if shared.source != "unknown" else ():
+                g = self.groups[i]
+                noise = shared.scaled(float(initial[g.entries][0]))
+                noises[i] = noise.at_least(stated_sigma(g.gauge))
+        sigmas = np.array(initial)
+        for g, noise in zip(self.groups, noises, strict=True):
+            if math.isfinite(noise.sigma):
+                sigmas[g.entries] = max(noise.sigma, SMALLEST_SIGMA)
+        first = float(sigmas[self.groups[0].entries][0])
+        pooled = self.pool(self.groups, sigmas).scaled(first)
+        common = combine_noises(noises, pooled, sigma=first)
+        return NoiseEstimate(tuple(noises), common, sigmas / first)
+
+    def common(self) -> Noise:
+        """Noise of the first gauge, with the present ratios of the gauges."""
+        first = float(self.sigma[self.groups[0].entries][0])
+        return self.pool(self.groups, self.sigma).scaled(first)
+
+    def pool(self, groups: Sequence[GaugeReadings], unit: Array) -> Noise:
+        """Noise of the readings of several gauges together, [unit].
+
+        Args:
+            groups: The gauges.
+            unit: Unit of each entry, shape (n_entries,), [m].
+        """
+        o, chosen = self.observations, np.logical_or.reduce([g.entries for g in groups])
+        unit = unit[chosen]
+        n_free_zeros = int((~o.zero_known[np.unique(o.zero[chosen])]).sum())
+        dof = float(chosen.sum() - n_free_zeros - self.used[chosen].sum())
+        start = float(np.sqrt(np.mean((self.sigma[chosen] / unit) ** 2)))
+        square = self.loss.robust_square(self.residual[chosen] / unit, dof=dof, start=start)
+        repeatability = math.nan, 0
+        # a wrong reading in repeated cycles would increase the noise of all readings
+        if not (self.loss.robust and dof > 1.0):
+            repeatability = estimate_repeatability(self.values[chosen] / unit, o.only(chosen))
+        stated = all(g.gauge.sigma is not None for g in groups)
+        sigmas, resolutions = np.zeros((2, len(self.sigma)))
+        for g in groups:
+            sigmas[g.entries] = g.gauge.sigma or 0.0
+            resolutions[g.entries] = g.gauge.resolution or 0.0
+        return estimate_noise(
+            repeatability=repeatability,
+            residual_square=square,
+            residual_dof=dof,
+            gauge_sigma=_root_mean_square(sigmas[chosen] / unit) if stated else None,
+            resolution=_root_mean_square(resolutions[chosen] / unit),
+        )
+
+
+def _is_determined(noise: Noise) -> bool:
+    """True if there are enough readings for the noise of one of several gauges."""
+    return max(noise.cycles_dof, noise.residual_dof) >= MIN_DOF
+
+
+def _root_mean_square(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _repeatability(values: Array, o: Observations, group: GaugeReadings) -> tuple[float, int]:

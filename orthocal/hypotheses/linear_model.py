@@ -86,7 +86,7 @@ class LinearModel:
         sigmas = np.full(o.size, assumed_sigma(session.gauge))
         if len(gauges) > 1:
             sigmas = initial_sigmas(session, o)
-        self.stated = session.gauge.sigma is not None
+        self.stated = all(g.gauge.sigma is not None for g in gauges)
         self.sigma = float(sigmas[gauges[0].entries][0])
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.problem = problem.with_noise_ratio(sigmas / self.sigma)

@@ -6,7 +6,8 @@ Tests return None if the noise is unknown.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,6 +26,9 @@ MIN_DOF = 0.5
 """Degrees of freedom below which residuals do not determine the noise."""
 
 NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
+
+_SOURCES: tuple[NoiseSource, ...] = ("residuals", "cycles", "gauge", "unknown")
+"""Sources; for several gauges the first of them counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +65,25 @@ class Noise:
         if self.cycles_dof > 0 and self.cycles_sigma > floor:
             return self.cycles_sigma, float(self.cycles_dof)
         return floor, math.inf
+
+    def scaled(self, factor: float) -> Noise:
+        """The same noise in another unit."""
+        return replace(
+            self,
+            sigma=self.sigma * factor,
+            cycles_sigma=self.cycles_sigma * factor,
+            residual_sigma=self.residual_sigma * factor,
+        )
+
+    def with_sigma(self, sigma: float) -> Noise:
+        """The same noise with another standard deviation of a reading, unless it is unknown."""
+        return self if math.isnan(self.sigma) else replace(self, sigma=sigma)
+
+    def at_least(self, floor: float) -> Noise:
+        """The noise, or the stated one of a gauge if that is larger, [m]."""
+        if not self.sigma < floor:
+            return self
+        return replace(self, sigma=floor, dof=math.inf, source="gauge")
 
     def exceeded_by_residuals(self, gauge: float | None) -> bool | None:
         """Test for residuals larger than the noise, which shows unmodelled errors.
@@ -216,3 +239,22 @@ def estimate_noise(
     return Noise(
         sigma, dof, source, cycles_sigma, cycles_dof, residual_sigma, max(residual_dof, 0.0)
     )
+
+
+def combine_noises(noises: Sequence[Noise], pooled: Noise, *, sigma: float) -> Noise:
+    """Noise of the first of several gauges, with degrees of freedom of the readings of all.
+
+    Args:
+        noises: Noise of each gauge.
+        pooled: Noise of all readings relative to `sigma` of their gauges, times that of the first.
+        sigma: Standard deviation of a reading of the first gauge, [m].
+    """
+    source = min((n.source for n in noises), key=_SOURCES.index)
+    dof = {
+        "residuals": pooled.residual_dof,
+        "cycles": float(pooled.cycles_dof),
+        "gauge": math.inf,
+        "unknown": 0.0,
+    }[source]
+    sigma = math.nan if source == "unknown" else sigma
+    return replace(pooled, sigma=sigma, dof=dof, source=source)

@@ -7,19 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from calibrated import calibrated, session_of
+from calibrated import calibrated, plan_of, session_of
 
 from orthocal import (
     SessionError,
     assess_tool,
+    draw_errors,
     join_sessions,
     load_calibration,
     load_session,
     restore_session,
+    simulate_session,
     write_calibration,
     write_session,
 )
+from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.calibration.identify import identify
+from orthocal.estimation.tolerance_scale import AS_STATED
+from orthocal.session.session import Gauge
 
 QUICK = {"solver": "variable-projection"}
 ORDER = {"reversed": lambda n: np.arange(n)[::-1], "shuffled": np.random.default_rng(5).permutation}
@@ -63,6 +68,75 @@ def test_the_order_of_rows_changes_no_estimate(order, workshop, calibration):
     assert tools[1].after.sizes.reported.rms == pytest.approx(
         tools[0].after.sizes.reported.rms, rel=1e-9
     )
+
+
+def with_two_gauges(setups_of_second, scale_of_second):
+    """Simulated readings of two dials; those of the second scatter more or less than stated."""
+    plan = plan_of("raw-cycles")
+    gauges = {"dial": Gauge(5e-6, 1e-5), "fine": Gauge(2e-6, 1e-6)}
+    setups = {
+        name: replace(setup, gauge="fine" if i in setups_of_second else "dial")
+        for i, (name, setup) in enumerate(plan.setups.items())
+    }
+    plan = replace(plan, gauges=gauges, setups=setups)
+    errors = draw_errors(plan.robot, plan.robot.parameters.select_model("full"), seed=4)
+    session = simulate_session(plan, errors, seed=4).session
+    exact = simulate_session(plan, errors, seed=4, sigma=0.0).session.values
+    scale = [scale_of_second if setups[r.setup].gauge == "fine" else 1.0 for r in session.readings]
+    return session.with_values(exact + scale * (session.values - exact))
+
+
+def with_other_gauge_first(session):
+    return replace(
+        session,
+        gauges=dict(reversed(session.gauges.items())),
+        setups=dict(reversed(session.setups.items())),
+        readings=session.readings[::-1],
+    )
+
+
+@pytest.mark.parametrize(
+    ("setups_of_second", "scale", "settings"),
+    [
+        ({1, 3, 5}, 1.0, {}),
+        ({1, 3, 5}, 5.0, {}),
+        ({1, 3, 5}, 0.1, {}),
+        ({1}, 5.0, {}),
+        ({1, 3, 5}, 5.0, {"loss": "huber"}),
+        ({1, 3, 5}, 5.0, {"choice": "offsets"}),
+    ],
+    ids=["as stated", "more", "less", "few readings", "robust", "offsets"],
+)
+@pytest.mark.parametrize("cycles", [False, True], ids=["once", "cycles"])
+def test_the_order_of_gauges_changes_no_estimate(setups_of_second, scale, settings, cycles):
+    session = with_two_gauges(setups_of_second, scale)
+    if not cycles:
+        session = session.select([r for r in session.readings if r.cycle == 1])
+    settings = {"choice": "full"} | settings | QUICK
+    found = [
+        identify(s, find_scale=lambda _: AS_STATED, **settings)[0]
+        for s in (session, with_other_gauge_first(session))
+    ]
+    assert [c.gauges[0].name for c in found] == ["dial", "fine"]
+    one, other = ({g.name: g.noise for g in c.gauges} for c in found)
+    for name, noise in one.items():
+        assert other[name].source == noise.source
+        for key in ("sigma", "dof", "residual_sigma", "residual_dof"):
+            assert getattr(other[name], key) == pytest.approx(getattr(noise, key), rel=1e-9)
+    assert found[1].noise.source == found[0].noise.source
+    assert found[1].noise.dof == pytest.approx(found[0].noise.dof, rel=1e-9)
+    # iterations of the robust loss end at smaller changes than this
+    within = 1e-8 if "loss" in settings else 1e-9
+    for quantity in (
+        lambda c: [p.value / p.prior_std for p in c.free],
+        lambda c: [p.std / p.prior_std for p in c.free],
+        lambda c: c.expanded_uncertainties / [p.prior_std for p in c.free],
+    ):
+        assert quantity(found[1]) == pytest.approx(quantity(found[0]), abs=within)
+    findings = [  # setups of different legs are equally idealised
+        [(f.kind, f.text) for f in find_fit_findings(c) if f.kind != "line assumed"] for c in found
+    ]
+    assert findings[1] == findings[0]
 
 
 def test_the_mechanical_zero_is_the_default_where_it_is_read(workshop):

@@ -113,12 +113,19 @@ def model_error(
     )
 
 
-def gauge_overstated(sigma: float, stated: float) -> Finding:
-    """Finding that the residuals are far smaller than the stated noise."""
+def gauge_overstated(sigma: float, stated: float, gauge: str) -> Finding:
+    """Finding that the residuals are far smaller than the stated noise.
+
+    Args:
+        sigma: Standard deviation of a reading from the residuals, [m].
+        stated: That of the gauge, [m].
+        gauge: Name of the gauge; empty if there is only one.
+    """
+    of_gauge = f" of the gauge '{gauge}'" if gauge else ""
     return note(
         "gauge overstated",
-        f"The residuals are only {sigma / stated:.2g} of the stated noise: the stated noise is too "
-        "large, or the readings were smoothed.",
+        f"The residuals{of_gauge} are only {sigma / stated:.2g} of the stated noise: the stated "
+        "noise is too large, or the readings were smoothed.",
         sigma_mm=sigma / MM,
         gauge_sigma_mm=stated / MM,
         ratio=sigma / stated,

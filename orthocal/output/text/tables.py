@@ -272,9 +272,10 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
     """Noise of several gauges, and nuisance parameters; None if there is neither."""
     parts: list[RenderableType] = []
     if len(calibration.gauges) > 1:
+        stated = ["" if g.sigma is None else mm(g.sigma) for g in calibration.gauges]
         rows = [
-            (g.name, str(g.readings), "" if g.sigma is None else mm(g.sigma), mm(g.noise), "mm")
-            for g in calibration.gauges
+            (g.name, str(g.readings), text, mm(g.noise.sigma), "mm")
+            for g, text in zip(calibration.gauges, stated, strict=True)
         ]
         table = table_of(("gauge", "readings", "σ stated", "σ estimated", "unit"), rows)
         note = "Weights are by σ estimated: from repeated cycles, else from the residuals."
