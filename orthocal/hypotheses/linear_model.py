@@ -478,15 +478,47 @@ class LinearModel:
     def approach(self, entries: Array, effect: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, with a further effect of unknown amount.
 
-        Gauss-Newton steps are needed because readings are not linear over offsets of some mm. They
-        end when no error changes by more than CONVERGED_CHANGE. A step to a machine that cannot
-        reach a posture, or whose rod the tip misses, is halved.
+        Directions that change readings only to second order, such as the height of a fixed ball
+        across the plane of motion, may have an optimum on both sides; the more likely one counts.
 
         Args:
             entries: Readings, zeros projected out, shape (n_entries,), [m].
             effect: Effect per unit, zeros projected out, shape (n_entries,); 0 without an effect.
         """
-        about = self.at_reference(keep_jacobian=False)
+
+        def misfit(about: ModelLinearisation) -> float:
+            deviation = entries - about.expected
+            (amount,), _ = about.likelihood.estimate_amounts(deviation, effect[None])
+            return about.likelihood.misfit(deviation - amount * effect)
+
+        best = self._descend(self.at_reference(keep_jacobian=False), entries, effect)
+        found = [best]
+        for theta in self._mirrored(best):
+            try:
+                start = self.linearise(theta, (), best.passive, keep_jacobian=False)
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
+                continue
+            found.append(self._descend(start, entries, effect))
+        return min(found, key=misfit)
+
+    def _mirrored(self, about: ModelLinearisation) -> Array:
+        """Starts on the other sides of directions of second order, (n_starts, n_free)."""
+        problem = self.problem
+        directions = problem.mirrored.of_task(self.sigma, ())
+        if not len(directions):
+            return np.empty((0, problem.n_free))
+        theta = self.reference + about.theta * problem.theta_scale
+        starts = problem.mirrored_starts(theta[None], about.passive[None], directions)
+        return np.asarray((starts[:, 0] - self.reference) / problem.theta_scale)
+
+    def _descend(
+        self, about: ModelLinearisation, entries: Array, effect: Array
+    ) -> ModelLinearisation:
+        """Gauss-Newton steps, because readings are not linear over offsets of some mm.
+
+        They end when no error changes by more than CONVERGED_CHANGE. A step to a machine that
+        cannot reach a posture, or whose rod the tip misses, is halved.
+        """
         for _ in range(MAX_STEPS):
             deviation = entries - about.expected
             (amount,), _ = about.likelihood.estimate_amounts(deviation, effect[None])

@@ -67,6 +67,9 @@ MIN_GAIN = 0.1
 LARGEST_TOLERANCE_SCALE = 5.0
 """Upper limit of the tolerance scale of a plausible machine."""
 
+UNUSUAL_TOLERANCE_SCALE = 2.0
+"""Tolerance scale above which a machine without anomaly is compared with the most likely one."""
+
 LARGEST_NOISE_SCALE = 2.5
 """Upper limit of the noise scale of a plausible gauge with a stated noise."""
 
@@ -121,6 +124,25 @@ class _Search:
     def run(self) -> Anomalies:
         """Search by forward selection and backward elimination.
 
+        Readings without anomaly are first explained by a machine near the reference, which shows
+        mistakes best. If something is found or that machine is unusual, the most likely machine of
+        all is compared with it, and the search is repeated about that one if it is as likely.
+        """
+        state, near = self._search()
+        unusual = state.score.tolerance_scale > UNUSUAL_TOLERANCE_SCALE
+        if state.terms or unusual or not self.is_plausible(state):
+            sound = self.sets.most_likely()
+            if sound is not None and sound.log_posterior > self.sound.log_posterior + MIN_GAIN:
+                needed = max((_needed(t) for t in state.terms), default=CLEAR_LOG_BAYES)
+                self.sound = sound
+                if state.log_posterior < sound.log_posterior + needed:
+                    self.scorer = FamilyScorer(self.model, sound.about)
+                    state, near = self._search()
+        return self._result(state, near)
+
+    def _search(self) -> tuple[HypothesisSet, list[tuple[HypothesisSet, HypothesisSet]]]:
+        """Select hypotheses about the present sound set; returns as `_select` does.
+
         A wrong unit or decimal point of many readings also explains a small part of several gross
         errors. If one is found, the search is repeated without such groups of readings. A
         correction is not proposed if it increases the residuals and the readings stay implausible.
@@ -132,7 +154,7 @@ class _Search:
                 state
             ):
                 state, near = other
-        return self._result(*((self.sound, []) if self._worsens(state) else (state, near)))
+        return (self.sound, []) if self._worsens(state) else (state, near)
 
     def _worsens(self, state: HypothesisSet) -> bool:
         """True if a correction increases the residuals and the readings are implausible."""
