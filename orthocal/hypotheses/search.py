@@ -179,11 +179,6 @@ class _Search:
             if extended is None:
                 break
             state = self._eliminate(extended)
-            if not state.terms:  # about a machine that fits better
-                if state.log_posterior < self.sound.log_posterior + MIN_GAIN:
-                    break
-                self.sound = state
-                continue
             near += [(extended, s) for s in alternatives]
             if alternatives and not is_local(self.session, state, alternatives):
                 break
@@ -298,33 +293,17 @@ class _Search:
         return score.tolerance_scale < LARGEST_TOLERANCE_SCALE and quiet
 
     def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
-        """Remove hypotheses that the others make superfluous.
-
-        The remaining ones are also linearised about the machine of all of them: errors of some mm
-        may end at a worse machine without a hypothesis that only leads away from it.
-        """
-        while state.terms:
+        """Remove hypotheses that the others make superfluous."""
+        while len(state.terms) > 1:
             sets = [[t for t in state.terms if t is not removed] for removed in state.terms]
             needed = [min(SIMILAR_LOG_BAYES, _needed(removed)) for removed in state.terms]
-            starts = self.sound.about, self._without_shifts(state)
-            evaluated = [self.sets.evaluate_all(sets, about) for about in starts]
-            better = [
-                max(pair, key=lambda s: s.log_posterior) for pair in zip(*evaluated, strict=True)
-            ]
-            reduced = zip(needed, better, strict=True)
+            evaluated = self.sets.evaluate_all(sets, self.sound.about)
+            reduced = zip(needed, evaluated, strict=True)
             needed_gain, best = max(reduced, key=lambda pair: pair[1].log_posterior)
             if best.log_posterior < state.log_posterior - needed_gain:
                 break
             state = best
         return state
-
-    def _without_shifts(self, state: HypothesisSet) -> ModelLinearisation:
-        """Linearisation about the machine of a state, without differences between readings."""
-        if not any(t.shift for t in state.terms):
-            return state.about
-        point = LinearisationPoint(state.about.theta, (), state.about.passive)
-        (about,) = self.model.linearise_all([point], keep_jacobian=self.model.has_shifts)
-        return about or self.sound.about
 
     def _expected(self, state: HypothesisSet, row: int) -> float:
         """Prediction of a row from all other corrected rows, as in a recording, [m]."""
