@@ -45,7 +45,6 @@ from orthocal.hypotheses.hypothesis_set import (
 )
 from orthocal.hypotheses.likelihood import log_of_sum
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
-from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
 from orthocal.hypotheses.set_evaluation import SetEvaluator
 from orthocal.session.session import Session
 
