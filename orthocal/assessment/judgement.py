@@ -35,6 +35,7 @@ from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import split_sessions
+from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import estimate_repeatability
@@ -44,6 +45,12 @@ FALSE_ALARM_RATE = 1e-3
 
 LARGEST_SCALE = 4.0
 """Tolerance scale above which the readings are rejected: no machine in working order has it."""
+
+OUTSTANDING_ERROR = 5.0
+"""Error of a parameter, in prior standard deviations, that may alone make readings implausible."""
+
+OUTSTANDING_SHARE = 0.75
+"""Share of the sum of squared errors, in prior standard deviations, that such an error has."""
 
 RESOLVED = 1e-3
 """Effect of one prior standard deviation of an offset on the readings, relative to the noise, below
@@ -105,8 +112,9 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
         scale = find_tolerance_scale(session)
         if scale.factor > LARGEST_SCALE:
             firmware = session.firmware is not None
+            cause = _find_outstanding_error(session)
             scale_findings = [
-                words.beyond_tolerances(scale.factor, LARGEST_SCALE, firmware=firmware)
+                words.beyond_tolerances(scale.factor, LARGEST_SCALE, cause, firmware=firmware)
             ]
         elif scale.factor > 1.0:
             scale_findings = [words.above_tolerances(scale.factor)]
@@ -207,6 +215,31 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
         share = factor**2 * machine_variances / (1.0 + factor**2 * machine_variances)
         scales.append(ToleranceScale(factor, float((share**2).sum())))
     return max(scales, key=lambda s: s.factor)
+
+
+def _find_outstanding_error(session: Session) -> tuple[Parameter, float] | None:
+    """Error of a part or mounting that alone makes readings implausible, [SI].
+
+    An artefact or a setup counts with all its parameters, such as the centre of a ball; the largest
+    is returned. None if several parts share the errors. Offsets may have any size.
+    """
+    for part in split_sessions(session):
+        model = linear_model(part)
+        problem, theta = model.problem, model.most_likely(part.values).theta
+        squares = theta**2
+        squares[list(model.offsets.values())] = 0.0
+        places = np.array(
+            [
+                name if i < problem.n_machine else ".".join(name.split(".")[:2])
+                for i, name in enumerate(problem.free)
+            ]
+        )
+        largest = int(np.argmax(squares))
+        share = squares[places == places[largest]].sum() / max(squares.sum(), 1e-300)
+        if squares[largest] > OUTSTANDING_ERROR**2 and share > OUTSTANDING_SHARE:
+            parameter = problem.selection.parameters[largest]
+            return parameter, float(theta[largest] * parameter.prior_std)
+    return None
 
 
 def _independent_contrasts(

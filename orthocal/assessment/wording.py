@@ -43,9 +43,16 @@ def review(
     return Finding(kind, "review", text, action, numbers, tuple(places))
 
 
-def reject(kind: FindingKind, text: str, action: str = "", /, **numbers: float) -> Finding:
+def reject(
+    kind: FindingKind,
+    text: str,
+    action: str = "",
+    places: Sequence[Place] = (),
+    /,
+    **numbers: float,
+) -> Finding:
     """Finding after which the readings must not be used."""
-    return Finding(kind, "reject", text, action, numbers)
+    return Finding(kind, "reject", text, action, numbers, tuple(places))
 
 
 def describe_actions(findings: Sequence[Finding]) -> str:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import mm, note, reject, review, times
+from orthocal.assessment.wording import mm, note, parameter_places, reject, review, times
 from orthocal.calibration.assessment_record import Finding, Place
-from orthocal.units import MM, UM
+from orthocal.robot.parameters import Parameter
+from orthocal.units import MM, UM, show_limit
 
 
 def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
@@ -27,8 +28,32 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
     )
 
 
-def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
-    """Finding that only errors of many times the stated tolerances explain the readings."""
+def beyond_tolerances(
+    scale: float, limit: float, outstanding: tuple[Parameter, float] | None, *, firmware: bool
+) -> Finding:
+    """Finding that only errors of many times the stated tolerances explain the readings.
+
+    Args:
+        scale: Factor between errors and tolerances.
+        limit: Largest factor of a machine in working order.
+        outstanding: Parameter that alone explains the readings, and its error, [SI].
+        firmware: Whether the readings are from a log of a printer.
+    """
+    if outstanding is not None:
+        parameter, error = outstanding
+        error, tolerance = (
+            v * parameter.edge_factor for v in (error, show_limit(parameter.prior_std))
+        )
+        unit = parameter.edge_unit
+        return reject(
+            "beyond tolerances",
+            f"One error explains these readings almost alone: {parameter.name} of {error:+.3g} "
+            f"{unit}, where at most ±{tolerance:g} {unit} are stated.",
+            "Measure that place or part again. If it is so far off, state its true value or a "
+            "larger tolerance.",
+            parameter_places(parameter.name),
+            tolerance_scale=scale,
+        )
     check = (
         "Check that the settings of the log are those with which it was probed. Then clean the bed "
         "and the nozzle, and probe again."

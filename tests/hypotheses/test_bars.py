@@ -1,4 +1,4 @@
-"""Sound readings of a ball bar, whose search once ended at another machine."""
+"""Readings of a ball bar: sound, and with a ball that is not where the session states it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from orthocal import draw_errors, load_plan, simulate_session
+from orthocal.assessment.judgement import judge_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.search import find_anomalies
 
@@ -52,3 +53,33 @@ def test_a_known_bar_on_a_machine_with_large_offsets_is_not_accused(
     anomalies = find_anomalies(simulate_session(plan, errors, seed=seed).session)
     assert anomalies.found == ()
     assert anomalies.tolerance_scale < 2.0
+
+
+@pytest.mark.parametrize(
+    ("axis", "off_mm", "verdict"),
+    [("x", 3.0, "enter"), ("x", 10.0, "reject"), ("y", -15.0, "reject")],
+)
+def test_a_misplaced_ball_is_named(root, tmp_path, axis, off_mm, verdict):
+    """Near its tolerance of 2 mm the fit follows it; far beyond, it is the only large error."""
+    plan = with_bar(root, tmp_path, "raw-cycles", ["xy"])
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=2)
+    name = f"ball.post.centre_{axis}"
+    session = simulate_session(plan, errors | {name: off_mm / 1e3}, seed=2).session
+    judgement = judge_session(session)
+    assert judgement.verdict == verdict
+    named = [p.parameter for f in judgement.findings if f.severity == "reject" for p in f.places]
+    assert named == ([name] if verdict == "reject" else [])
+    if named:
+        (text,) = [f.text for f in judgement.findings if f.severity == "reject"]
+        amount = float(text.split(" of ")[1].split(" mm")[0])
+        assert amount == pytest.approx(off_mm, rel=0.1)
+
+
+def test_errors_of_many_parts_name_none(root, tmp_path):
+    plan = with_bar(root, tmp_path, "raw-cycles", ["xy", "yz", "zx"])
+    names = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
+    drawn = draw_errors(plan.robot, names, seed=3)
+    session = simulate_session(plan, {n: 8.0 * v for n, v in drawn.items()}, seed=3).session
+    (finding,) = [f for f in judge_session(session).findings if f.severity == "reject"]
+    assert finding.kind == "beyond tolerances"
+    assert finding.places == ()
