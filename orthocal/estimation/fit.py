@@ -28,6 +28,7 @@ from orthocal.estimation.weighting import (
     leverages,
     split_by_gauge,
     with_initial_noise,
+    with_repeatability,
 )
 from orthocal.statistics.information import (
     Information,
@@ -220,6 +221,7 @@ def fit_problem(
     """
     began = time.perf_counter()
     groups = split_by_gauge(problem.session, problem.observations)
+    groups = with_repeatability(groups, problem)
     if (problem.noise_ratio == 1.0).all():
         problem = with_initial_noise(problem)
     linear = linearise_problem(problem)
@@ -497,7 +499,6 @@ def _scatter(
         groups=groups,
         observations=o,
         loss=program.options.loss,
-        values=problem.values * ratio,
         residual=residual * ratio,
         used=used,
         sigma=sigma * ratio,

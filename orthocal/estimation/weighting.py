@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,6 +49,8 @@ class GaugeReadings:
     """The gauge."""
     entries: Mask
     """Mask of the entries of the gauge, shape (n_entries,)."""
+    repeatability: tuple[float, int] = (math.nan, 0)
+    """Scatter of repeated cycles, [m], and its degrees of freedom, once it is computed."""
 
 
 def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeReadings, ...]:
@@ -60,6 +62,14 @@ def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeR
         for i, (name, gauge) in enumerate(session.gauges.items())
         if (gauge_of == i).any()
     )
+
+
+def with_repeatability(
+    groups: Sequence[GaugeReadings], problem: CalibrationProblem
+) -> tuple[GaugeReadings, ...]:
+    """The gauges with the scatter of their repeated cycles."""
+    o, values = problem.observations, problem.values * problem.noise_ratio
+    return tuple(replace(g, repeatability=_repeatability(values, o, g)) for g in groups)
 
 
 def stated_sigma(gauge: Gauge) -> float:
@@ -156,8 +166,6 @@ class Scatter:
     """The entries."""
     loss: Loss
     """Cost of a residual."""
-    values: Array
-    """Readings of the entries, [m]."""
     residual: Array
     """Residuals, gauge zeros eliminated, [m]."""
     used: Array
@@ -206,22 +214,25 @@ class Scatter:
             unit: Unit of each entry, shape (n_entries,), [m].
         """
         o, chosen = self.observations, np.logical_or.reduce([g.entries for g in groups])
+        cycles = [(*g.repeatability, float(unit[g.entries][0])) for g in groups]
         unit = unit[chosen]
         n_free_zeros = int((~o.zero_known[np.unique(o.zero[chosen])]).sum())
         dof = float(chosen.sum() - n_free_zeros - self.used[chosen].sum())
         start = float(np.sqrt(np.mean((self.sigma[chosen] / unit) ** 2)))
         square = self.loss.robust_square(self.residual[chosen] / unit, dof=dof, start=start)
-        repeatability = math.nan, 0
+        cycles_dof = sum(n for _, n, _ in cycles)
         # a wrong reading in repeated cycles would increase the noise of all readings
-        if not (self.loss.robust and dof > 1.0):
-            repeatability = estimate_repeatability(self.values[chosen] / unit, o.only(chosen))
+        if self.loss.robust and dof > 1.0:
+            cycles_dof = 0
+        cycles_square = sum((s / u) ** 2 * n for s, n, u in cycles if n)
+        scatter = math.sqrt(cycles_square / cycles_dof) if cycles_dof else math.nan
         stated = all(g.gauge.sigma is not None for g in groups)
         sigmas, resolutions = np.zeros((2, len(self.sigma)))
         for g in groups:
             sigmas[g.entries] = g.gauge.sigma or 0.0
             resolutions[g.entries] = g.gauge.resolution or 0.0
         return estimate_noise(
-            repeatability=repeatability,
+            repeatability=(scatter, cycles_dof),
             residual_square=square,
             residual_dof=dof,
             gauge_sigma=_root_mean_square(sigmas[chosen] / unit) if stated else None,
