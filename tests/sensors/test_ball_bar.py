@@ -106,7 +106,7 @@ def test_no_gauge_counts_as_finer_than_stated(tmp_path):
     assert found.solver.noise_converged
     for gauge in found.gauges:
         rounding = (gauge.resolution or 0.0) / np.sqrt(12.0)
-        assert gauge.noise > 0.9999 * np.hypot(gauge.sigma, rounding)
+        assert gauge.noise.sigma > 0.9999 * np.hypot(gauge.sigma, rounding)
 
 
 @pytest.mark.slow
