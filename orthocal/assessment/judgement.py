@@ -26,6 +26,7 @@ from orthocal.assessment.words.anomalies import (
     describe_anomalies,
     describe_no_change,
     describe_wrong_order,
+    place_of,
 )
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale, trial_scales
@@ -33,7 +34,7 @@ from orthocal.hypotheses.anomaly import Anomalies
 from orthocal.hypotheses.families.sessions import detectable_changes
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
-from orthocal.hypotheses.search import find_anomalies
+from orthocal.hypotheses.search import find_anomalies, find_suspected_rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
@@ -51,6 +52,9 @@ OUTSTANDING_ERROR = 5.0
 
 OUTSTANDING_SHARE = 0.75
 """Share of the sum of squared errors, in prior standard deviations, that such an error has."""
+
+MAX_SUSPECTED = 6
+"""Most readings that are named as the likeliest to be wrong."""
 
 RESOLVED = 1e-3
 """Effect of one prior standard deviation of an offset on the readings, relative to the noise, below
@@ -111,11 +115,7 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
         if scale.factor > LARGEST_SCALE:
-            firmware = session.firmware is not None
-            cause = _find_outstanding_error(session)
-            scale_findings = [
-                words.beyond_tolerances(scale.factor, LARGEST_SCALE, cause, firmware=firmware)
-            ]
+            scale_findings = [_describe_beyond(session, scale.factor)]
         elif scale.factor > 1.0:
             scale_findings = [words.above_tolerances(scale.factor)]
     no_change = [] if mistakes or not session.joined else [_describe_detectable(session)]
@@ -215,6 +215,21 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
         share = factor**2 * machine_variances / (1.0 + factor**2 * machine_variances)
         scales.append(ToleranceScale(factor, float((share**2).sum())))
     return max(scales, key=lambda s: s.factor)
+
+
+def _describe_beyond(session: Session, scale: float) -> Finding:
+    """Finding about errors far beyond the tolerances, with what may explain them."""
+    outstanding = _find_outstanding_error(session)
+    suspected: tuple[int, ...] = ()
+    if outstanding is None:
+        suspected = find_suspected_rows(session)
+    return words.beyond_tolerances(
+        scale,
+        LARGEST_SCALE,
+        outstanding,
+        [place_of(session, i) for i in suspected] if len(suspected) <= MAX_SUSPECTED else [],
+        firmware=session.firmware is not None,
+    )
 
 
 def _find_outstanding_error(session: Session) -> tuple[Parameter, float] | None:

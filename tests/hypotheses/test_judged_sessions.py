@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibrated import plan_of, session_of
+from made_mistakes import make_mistakes, sound_session
 from scipy.stats import chi2
 
 from orthocal import (
@@ -44,6 +45,18 @@ def test_a_reversed_setup_is_named(session, setup):
     assert found.decision.verdict == "review"
     (finding,) = found.of_kind("reversed sign", "ambiguous")  # or single readings of it
     assert {p.setup for p in finding.places} == {setup}
+
+
+@pytest.mark.parametrize("mistake", ["sign of a reading", "reading a tenth"])
+def test_the_likeliest_line_of_rejected_readings_is_named(mistake):
+    """No mistake has clear evidence, but only readings far beyond the tolerances are explained."""
+    session = sound_session(plan_of("workshop"), 0, entered=False)
+    (made,) = [m for n, _, m in make_mistakes(session, 0, sizes=(20.0,)) if n == mistake]
+    (row,) = made.rows
+    found = check_session(session.with_values(made.values))
+    (finding,) = found.of_kind("beyond tolerances")
+    place = session.readings[row]
+    assert [(p.setup, p.posture) for p in finding.places] == [(place.setup, place.posture)]
 
 
 def test_one_difference_per_setup_does_not_determine_its_sign():

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from orthocal.assessment.wording import mm, note, parameter_places, reject, review, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.robot.parameters import Parameter
+from orthocal.text import spans
 from orthocal.units import MM, UM, show_limit
 
 
@@ -29,7 +30,12 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
 
 
 def beyond_tolerances(
-    scale: float, limit: float, outstanding: tuple[Parameter, float] | None, *, firmware: bool
+    scale: float,
+    limit: float,
+    outstanding: tuple[Parameter, float] | None,
+    suspected: Sequence[Place],
+    *,
+    firmware: bool,
 ) -> Finding:
     """Finding that only errors of many times the stated tolerances explain the readings.
 
@@ -37,6 +43,7 @@ def beyond_tolerances(
         scale: Factor between errors and tolerances.
         limit: Largest factor of a machine in working order.
         outstanding: Parameter that alone explains the readings, and its error, [SI].
+        suspected: Readings that are the likeliest to be wrong, if any is.
         firmware: Whether the readings are from a log of a printer.
     """
     if outstanding is not None:
@@ -65,9 +72,18 @@ def beyond_tolerances(
         "beyond tolerances",
         f"Only errors of {times(scale)} the stated tolerances explain these readings. Above "
         f"{limit:g} times, the readings are wrong or the machine is out of adjustment.",
-        check,
+        f"{_describe_suspected(suspected)}{check}",
+        suspected,
         tolerance_scale=scale,
     )
+
+
+def _describe_suspected(places: Sequence[Place]) -> str:
+    """Sentence about readings that are the likeliest to be wrong; "" without lines of one file."""
+    lines = sorted({p.line for p in places if p.line is not None})
+    if not lines or len({p.file for p in places}) > 1:
+        return ""
+    return f"If a single reading is wrong, it is most likely in {spans(lines, 'line')}. "
 
 
 def above_tolerances(scale: float) -> Finding:
