@@ -50,7 +50,7 @@ LARGEST_SCALE = 4.0
 OUTSTANDING_ERROR = 5.0
 """Error of a parameter, in prior standard deviations, that may alone make readings implausible."""
 
-OUTSTANDING_SHARE = 0.75
+OUTSTANDING_SHARE = 0.6
 """Share of the sum of squared errors, in prior standard deviations, that such an error has."""
 
 MAX_SUSPECTED = 6
@@ -111,6 +111,8 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     """
     mistakes = _find_mistakes(session, anomalies)
     implausible = find_implausible(session, explained=bool(mistakes))
+    if any(f.kind == "wrong dimensions" for f in implausible):
+        implausible = _explain_dimensions(session, implausible)
     scale, scale_findings = AS_STATED, []
     if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
@@ -118,7 +120,8 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
             scale_findings = [_describe_beyond(session, scale.factor)]
         elif scale.factor > 1.0:
             scale_findings = [words.above_tolerances(scale.factor)]
-    no_change = [] if mistakes or not session.joined else [_describe_detectable(session)]
+    sound = verdict_of([*mistakes, *implausible, *scale_findings]) == "enter"
+    no_change = [_describe_detectable(session)] if session.joined and sound else []
     order = _describe_order(session) if session.joined else []
     unshown_effects = find_unshown_effects(session)
     return Judgement(
@@ -217,16 +220,24 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
     return max(scales, key=lambda s: s.factor)
 
 
+def _explain_dimensions(session: Session, findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Findings with wrong dimensions replaced by a mounting that alone explains the readings."""
+    outstanding = _find_outstanding_error(session)
+    if outstanding is None or outstanding[0].name in session.robot.parameters:
+        return tuple(findings)
+    described = words.outstanding_error(*outstanding)
+    return tuple(described if f.kind == "wrong dimensions" else f for f in findings)
+
+
 def _describe_beyond(session: Session, scale: float) -> Finding:
     """Finding about errors far beyond the tolerances, with what may explain them."""
     outstanding = _find_outstanding_error(session)
-    suspected: tuple[int, ...] = ()
-    if outstanding is None:
-        suspected = find_suspected_rows(session)
+    if outstanding is not None:
+        return words.outstanding_error(*outstanding)
+    suspected = find_suspected_rows(session)
     return words.beyond_tolerances(
         scale,
         LARGEST_SCALE,
-        outstanding,
         [place_of(session, i) for i in suspected] if len(suspected) <= MAX_SUSPECTED else [],
         firmware=session.firmware is not None,
     )

@@ -18,8 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.records import GaugeRecord
 from orthocal.calibration.refit import restore_mounting_covariance
+from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
 from orthocal.session.session import known_approach, split_label
@@ -30,8 +33,14 @@ from orthocal.statistics.distributions import (
     incomplete_beta,
     least_number,
 )
-from orthocal.statistics.information import whiten
+from orthocal.statistics.noise import FEW_DOF, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
+
+MAX_STEPS = 12
+"""Largest number of Gauss-Newton steps to the least χ²."""
+
+SMALL_DECREASE = 1e-3
+"""Decrease of χ² by a step below which it is the least one."""
 
 MIN_ROWS = 3
 """Number of shared rows below which the correlation of residuals is unknown."""
@@ -52,53 +61,143 @@ class DeviationTest:
 def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
     """Test the deviations of a new session against their predictive distribution.
 
-    χ² = rᵀ V⁻¹ r with r = y − h(θ, ν) + G ν, the mountings ν of the fit, and no gauge zeros.
-    If the noise was estimated, χ² per degree of freedom has an F distribution. Without priors the
-    residuals of the calibration are the noise, because they contain unmodelled errors.
+    χ² is the least value of |y − h(θ, ν)|²/σ² + (θ − θ₁)ᵀ C⁻¹ (θ − θ₁) + νᵀ Γ⁻¹ ν, with the
+    calibrated parameters θ₁. It is rᵀ V⁻¹ r if readings are linear, which a ball that is displaced
+    by 1 mm is not. If the noise was estimated, χ² per degree of freedom has an F distribution.
 
     Args:
         calibration: The calibration.
         fit: Fit of the same parameters to the new session.
     """
     problem, n = fit.problem, fit.problem.n_machine
-    scale, observations, noise = problem.theta_scale, problem.observations, calibration.noise
-    sigma, sigma_dof = noise.residual_sigma, noise.residual_dof
-    if calibration.prior:
-        sigma, sigma_dof = float(np.fmax(sigma, noise.sigma)), noise.dof
-    dof = observations.size - observations.n_free_zeros
-    if not (sigma > 0.0 and sigma_dof > 0.0 and dof > 0):
+    noise = _predict_noise(calibration, fit)
+    dof = problem.observations.size - problem.observations.n_free_zeros
+    if not (np.all(noise.sigma > 0.0) and noise.dof > 0.0 and dof > 0):
         return DeviationTest(math.nan, math.nan)
     covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
+    scale = problem.theta_scale
     covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(
         scale[:n], scale[:n]
     )
     variances, directions = np.linalg.eigh(covariance)
     root = directions * np.sqrt(np.maximum(variances, 0.0))
-    # linearised about the mountings of the fit, as a ball displaced by 1 mm is not linear
-    mountings = fit.solution.theta[n:]
-    theta = np.append([p.value for p in calibration.free], mountings)
-    shift_of_mountings = fit.jacobian[:, n:] @ ((problem.prior_mean[n:] - mountings) / scale[n:])
-    deviation = project_out_zeros(
-        problem.values - problem.predict(theta) - shift_of_mountings, observations
-    )
-    whitened = whiten(deviation, project_out_zeros(fit.jacobian, observations) @ root, sigma=sigma)
-    square = float(whitened @ whitened)
+    centre = np.append([p.value for p in calibration.free], problem.prior_mean[n:])
+    square = _least_square(fit, centre, root, noise.sigma)
 
     def p_value(factor: float) -> float:
         scaled = square * factor**2
-        if math.isinf(sigma_dof):
+        if math.isinf(noise.dof):
             return chi_square_tail(dof, scaled)
-        return f_tail(dof, sigma_dof, scaled / dof)
+        return f_tail(dof, noise.dof, scaled / dof)
 
     critical_factor = least_number(lambda f: p_value(f) < BY_CHANCE) if square > 0.0 else math.nan
     return DeviationTest(p_value(1.0), critical_factor)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _PredictedNoise:
+    """Noise of new readings, predicted by a calibration."""
+
+    sigma: Array
+    """Standard deviation of each entry, shape (n_entries,), [m]; NaN if unknown."""
+    dof: float
+    """Degrees of freedom."""
+
+
+def _predict_noise(calibration: Calibration, fit: Fit) -> _PredictedNoise:
+    """Noise of the readings of a new session.
+
+    That of a gauge of the calibration is as estimated there. It contains unmodelled errors, without
+    priors always the residuals. Another gauge has its stated noise and the same unmodelled errors.
+    Degrees of freedom of several gauges are combined as Satterthwaite (1946) does.
+    """
+    sigma, inverse_dof = np.empty(fit.problem.observations.size), 0.0
+    for group, own in zip(fit.groups, fit.noises.gauges, strict=True):
+        stated = group.gauge.sigma, group.gauge.resolution
+        known = [k for k in calibration.gauges if (k.sigma, k.resolution) == stated]
+        if known:
+            found = [_of_calibration(calibration, k) for k in known]
+            variance = sum(s**2 for s, _ in found) / len(found)
+            dof = sum(dof for _, dof in found)
+        else:
+            separate, dof = noise_floor(*stated), math.inf
+            if own.cycles_dof >= FEW_DOF:
+                separate, dof = own.without_residuals(*stated)
+            if not separate > 0.0:
+                separate, dof = own.sigma, own.dof
+            variance = separate**2
+            for k in calibration.gauges:
+                if k.noise.source == "residuals":  # with unmodelled errors
+                    total, total_dof = _of_calibration(calibration, k)
+                    separate, _ = k.noise.without_residuals(k.sigma, k.resolution)
+                    variance += max(total**2 - separate**2, 0.0) / len(calibration.gauges)
+                    dof = min(dof, total_dof)
+        sigma[group.entries] = math.sqrt(variance)
+        inverse_dof += float(np.mean(group.entries)) ** 2 / dof if dof > 0.0 else math.inf
+    return _PredictedNoise(sigma, 1.0 / inverse_dof if inverse_dof else math.inf)
+
+
+def _of_calibration(calibration: Calibration, gauge: GaugeRecord) -> tuple[float, float]:
+    """Noise of a gauge as new readings show it, [m], and its degrees of freedom."""
+    noise = gauge.noise
+    if calibration.prior:
+        return float(np.fmax(noise.residual_sigma, noise.sigma)), noise.dof
+    return noise.residual_sigma, noise.residual_dof
+
+
+def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> float:
+    """Least |y − h(x)|²/σ² + |z|² over x = centre + root z, by Gauss-Newton steps from the fit.
+
+    Args:
+        fit: Fit to the new readings.
+        centre: Predicted parameters, shape (n_free,), [SI].
+        root: Square root of their covariance, shape (n_free, n_free), [prior std].
+        sigma: Standard deviation of each entry, shape (n_entries,), [m].
+    """
+    problem = fit.problem.with_noise_ratio(sigma / sigma[0])
+    o, scale = problem.observations, problem.theta_scale
+
+    def linearise(theta: Array, start: Array) -> tuple[Array, tuple[Array, Array]]:
+        """Passive coordinates; residuals and derivatives, zeros projected out, [σ]."""
+        closed = problem.close(theta, start=start)
+        reading, jacobian = problem.predict_and_jacobian(theta, closed)
+        residual = project_out_zeros(problem.values - reading, o)
+        return closed, (residual / sigma[0], project_out_zeros(jacobian, o) / sigma[0])
+
+    def least(deviation: Array, jacobian: Array) -> Array:
+        along = jacobian @ root
+        return np.asarray(
+            np.linalg.solve(along.T @ along + np.eye(len(along.T)), along.T @ deviation)
+        )
+
+    passive, (residual, jacobian) = linearise(fit.solution.theta, fit.solution.passive)
+    deviation = residual + jacobian @ ((fit.solution.theta - centre) / scale)
+    z, before, best = least(deviation, jacobian), np.zeros(len(root)), math.inf
+    residual = deviation - jacobian @ root @ z
+    linear = float(residual @ residual + z @ z)
+    for _ in range(MAX_STEPS):
+        try:
+            closed, (residual, jacobian) = linearise(centre + scale * (root @ z), passive)
+            square = float(residual @ residual + z @ z)
+        except ClosureError:
+            square = math.inf
+        if not (square <= best and math.isfinite(square)):  # too far, or a tip misses its rod
+            z = 0.5 * (before + z)
+            continue
+        converged = best - square < SMALL_DECREASE
+        before, best, passive = z, square, closed
+        if converged:
+            break
+        z = least(residual + jacobian @ root @ z, jacobian)
+    return best if math.isfinite(best) else linear
+
+
 def expect_rms(calibration: Calibration, fit: Fit) -> float:
     """Predicted RMS of the deviations in the rows of a new session, [m].
 
-    It combines the RMS residual of the calibration with the effect of the mountings of both
-    sessions: sqrt(rms² + tr(J (G_old + G_new) Jᵀ) / n).
+    It combines the noise of the readings with the effect of the mountings of both sessions:
+    sqrt(rms² + tr(J (G_old + G_new) Jᵀ) / n). Of the same gauges rms is the RMS residual of the
+    calibration, of others in proportion to their noise.
 
     Args:
         calibration: The calibration.
@@ -107,12 +206,18 @@ def expect_rms(calibration: Calibration, fit: Fit) -> float:
     problem, n = fit.problem, fit.problem.n_machine
     mounting_covariance = restore_mounting_covariance(calibration) + fit.mounting_covariance
     jacobian = project_out_zeros(
-        fit.jacobian[:, :n] / problem.theta_scale[:n], problem.observations
+        fit.jacobian[:, :n] / problem.theta_scale[:n] * problem.noise_ratio[:, None],
+        problem.observations,
     )
     square = max(float(np.trace(jacobian @ mounting_covariance @ jacobian.T)), 0.0)
     rows = problem.session.readings
     entries_per_row = sum(1.0 + problem.session.is_difference(r) for r in rows) / len(rows)
-    return math.sqrt(calibration.rms_after**2 + entries_per_row * square / len(rows))
+    counts = [k.readings for k in calibration.gauges]
+    old = [_of_calibration(calibration, k)[0] ** 2 for k in calibration.gauges]
+    new = np.mean(_predict_noise(calibration, fit).sigma ** 2)
+    ratio = float(new / np.average(old, weights=counts))
+    rms_square = calibration.rms_after**2 * (ratio if math.isfinite(ratio) else 1.0)
+    return math.sqrt(rms_square + entries_per_row * square / len(rows))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

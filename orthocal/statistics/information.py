@@ -300,17 +300,3 @@ def _reduce(rows: Array) -> Array:
         direction = remaining[:, pivots[-1]] / norms[pivots[-1]]
         remaining -= np.outer(direction, direction @ remaining)
     return np.asarray(np.linalg.solve(basis[:, pivots], basis))
-
-
-def whiten(values: Array, root: Array, *, sigma: float) -> Array:
-    """Whitened values V^(-1/2) y, V = σ² I + S Sᵀ.
-
-    Args:
-        values: Values y, shape (n,) or (n, k).
-        root: Square root S of the common covariance, shape (n, m), [unit of y].
-        sigma: Independent standard deviation of each value, [unit of y].
-    """
-    directions, singular_values, _ = np.linalg.svd(root, full_matrices=False)
-    shrunk = 1.0 - 1.0 / np.sqrt(1.0 + (singular_values / sigma) ** 2)
-    projected = (directions.T @ values).T * shrunk
-    return np.asarray((values - directions @ projected.T) / sigma)

@@ -159,6 +159,23 @@ def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
     assert np.mean(probabilities) == pytest.approx(0.5, abs=3.0 / np.sqrt(12 * count))
 
 
+@pytest.mark.parametrize(("sigma_um", "seed"), [(2.0, 3), (20.0, 4), (50.0, 5)])
+def test_another_gauge_has_its_own_noise(plan, sigma_um, seed):
+    """The second session is read with another dial than the first."""
+    first = simulate_session(plan, TRUTH, seed=seed).session
+    before, _ = identify(first, "full", **QUICK)
+    other = plan.with_gauge(replace(plan.gauge, sigma=sigma_um * 1e-6, resolution=None))
+    offsets = [before[f"{d.name}.offset"].value for d in plan.robot.drives]
+    entered = other.with_controller(np.round(offsets, 6))
+    sound = simulate_session(entered, TRUTH, seed=100 + seed).session
+    p_sound = judge_deviations(before, repeat_fit(before, sound)).p_value
+    assert 0.01 < p_sound < 0.99
+    rng, place = np.random.default_rng(seed), [(r.setup, r.posture) for r in sound.readings]
+    errors = {key: 2e-4 * rng.normal() for key in dict.fromkeys(place)}  # in all cycles
+    worse = sound.with_values(sound.values + [errors[key] for key in place])
+    assert judge_deviations(before, repeat_fit(before, worse)).p_value < 1e-6
+
+
 def test_a_session_with_other_offsets_is_refused(paper, experiment_3):
     with pytest.raises(SessionError, match="not measured with the offsets to enter"):
         validate_calibration(paper, experiment_3.with_controller(np.zeros(3)))

@@ -32,7 +32,6 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
 def beyond_tolerances(
     scale: float,
     limit: float,
-    outstanding: tuple[Parameter, float] | None,
     suspected: Sequence[Place],
     *,
     firmware: bool,
@@ -42,25 +41,9 @@ def beyond_tolerances(
     Args:
         scale: Factor between errors and tolerances.
         limit: Largest factor of a machine in working order.
-        outstanding: Parameter that alone explains the readings, and its error, [SI].
         suspected: Readings that are the likeliest to be wrong, if any is.
         firmware: Whether the readings are from a log of a printer.
     """
-    if outstanding is not None:
-        parameter, error = outstanding
-        error, tolerance = (
-            v * parameter.edge_factor for v in (error, show_limit(parameter.prior_std))
-        )
-        unit = parameter.edge_unit
-        return reject(
-            "beyond tolerances",
-            f"One error explains these readings almost alone: {parameter.name} of {error:+.3g} "
-            f"{unit}, where at most ±{tolerance:g} {unit} are stated.",
-            "Measure that place or part again. If it is so far off, state its true value or a "
-            "larger tolerance.",
-            parameter_places(parameter.name),
-            tolerance_scale=scale,
-        )
     check = (
         "Check that the settings of the log are those with which it was probed. Then clean the bed "
         "and the nozzle, and probe again."
@@ -75,6 +58,21 @@ def beyond_tolerances(
         f"{_describe_suspected(suspected)}{check}",
         suspected,
         tolerance_scale=scale,
+    )
+
+
+def outstanding_error(parameter: Parameter, error: float) -> Finding:
+    """Finding about one error far beyond its tolerance, [SI], that explains the readings."""
+    error, tolerance = (v * parameter.edge_factor for v in (error, show_limit(parameter.prior_std)))
+    unit = parameter.edge_unit
+    return reject(
+        "beyond tolerances",
+        f"One error explains these readings almost alone: {parameter.name} of about {error:+.3g} "
+        f"{unit}, where at most ±{tolerance:g} {unit} are stated.",
+        "Measure that place or part again. If it is so far off, state its true value or a larger "
+        "tolerance.",
+        parameter_places(parameter.name),
+        **{f"error_{unit}": error, f"tolerance_{unit}": tolerance},
     )
 
 
