@@ -65,6 +65,19 @@ class SessionError(OrthocalError):
     """A session, its YAML or its CSV is invalid."""
 
 
+class UnreachablePathError(SessionError):
+    """The tool cannot follow its path to a posture of a setup.
+
+    Attributes:
+        setup: Name of the setup.
+        posture: Name of the posture.
+    """
+
+    def __init__(self, message: str, *, setup: str, posture: str, where: str | None = None) -> None:
+        super().__init__(message, where=where)
+        self.setup, self.posture = setup, posture
+
+
 class CalibrationFileError(OrthocalError):
     """A calibration file is invalid, or does not belong to the robot that it names."""
 

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.errors import UnreachablePathError
 from orthocal.measurement.motion.motion import state_path_approaches
 from orthocal.planning.candidates import Candidates
 from orthocal.planning.selection import PlannedSetup
@@ -24,11 +25,24 @@ def build_session(
 
     Each setup begins with the posture in which its gauge is aligned, continues with short motions,
     and ends with the first posture. If an effect depends on the approach, postures in which a drive
-    reverses on the path of the tool are omitted, because their approach is unknown.
+    reverses on the path of the tool are omitted, because their approach is unknown. So are postures
+    to which a prescribed path, such as that of a ball bar, leaves the workspace.
+
+    Raises:
+        UnreachablePathError: If too few postures of a setup remain.
     """
     while True:
-        plan = _order_readings(candidates, planned, measured)
-        names = dict.fromkeys(names_in_files(s)[0] for s in plan.setups.values())
+        try:
+            plan = _order_readings(candidates, planned, measured)
+        except UnreachablePathError as e:
+            reduced = [
+                _without(candidates, setup, {e.posture} if name == base_name(e.setup) else set())
+                for name, setup in _named(candidates, planned, measured)
+            ]
+            if sum(len(s.chosen) for s in reduced) == sum(len(s.chosen) for s in planned):
+                raise
+            planned = reduced
+            continue
         unknown_approach = {
             (base_name(r.setup), r.posture)
             for r in plan.readings
@@ -36,7 +50,7 @@ def build_session(
         }
         reduced = [
             _without(candidates, setup, {p for s, p in unknown_approach if s == name})
-            for name, setup in zip(names, _in_order(candidates, planned), strict=True)
+            for name, setup in _named(candidates, planned, measured)
         ]
         if sum(len(s.chosen) for s in reduced) == sum(len(s.chosen) for s in planned):
             return plan
@@ -64,20 +78,31 @@ def _in_order(candidates: Candidates, planned: Sequence[PlannedSetup]) -> list[P
     return sorted(planned, key=place)
 
 
+def _named(
+    candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None
+) -> list[tuple[str, PlannedSetup]]:
+    """Planned setups with their names, in the order of measuring."""
+    source, named = candidates.session, []
+    used_names = set() if measured is None else {base_name(name) for name in measured.setups}
+    for setup in _in_order(candidates, planned):
+        base, _ = names_in_files(source.setups[candidates.setups[setup.candidate].name])
+        name = _setup_name(base, used_names)
+        used_names.add(name)
+        named.append((name, setup))
+    return named
+
+
 def _order_readings(
     candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None
 ) -> Session:
     """Session of planned setups with the approaches that follow from their paths."""
     source = candidates.session
-    used_names = set() if measured is None else {base_name(name) for name in measured.setups}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     postures: dict[str, Posture] = {}
-    for setup in _in_order(candidates, planned):
+    for name, setup in _named(candidates, planned, measured):
         candidate = candidates.setups[setup.candidate]
         base, _ = names_in_files(source.setups[candidate.name])
-        name = _setup_name(base, used_names)
-        used_names.add(name)
         lines = [source.readings[i : i + candidate.width] for i in candidate.rows[[*setup.chosen]]]
         first = lines[0][0].posture
         for r in lines[0]:

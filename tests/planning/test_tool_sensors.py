@@ -28,7 +28,7 @@ from orthocal import (
 )
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.loading import with_effects
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError, UnreachablePathError
 from orthocal.estimation.choice import resolve_choice
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
@@ -39,7 +39,7 @@ from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
 from orthocal.output.text.plan import describe_absent, plan_json
-from orthocal.planning import tool_candidates
+from orthocal.planning import planned_session, tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
 from orthocal.planning.expected_error import ToolForecast
@@ -283,8 +283,9 @@ def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
     assert {p.values[2] for p in postures.values()} == {0.02}
 
 
-def test_postures_in_which_a_drive_reverses_are_omitted(owned, monkeypatch):
-    """On the arcs of a bar a drive may reverse in a posture, whose approach is then unknown."""
+@pytest.fixture
+def planned_bar(owned, monkeypatch):
+    """Candidates and a planned setup of a ball bar with twelve postures."""
     robot = replace(with_effects(load_robot("linear_delta"), ["backlash"]), legs={})
     equipment = Equipment(owned=owned(bar=BAR.replace("length_mm: 50", "length_mm: 60")))
     monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:1])
@@ -293,6 +294,12 @@ def test_postures_in_which_a_drive_reverses_are_omitted(owned, monkeypatch):
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     count = len(candidates.setups[0].rows)
     planned = [PlannedSetup(0, tuple(np.random.default_rng(0).permutation(count)[:12].tolist()))]
+    return candidates, planned
+
+
+def test_postures_in_which_a_drive_reverses_are_omitted(planned_bar):
+    """On the arcs of a bar a drive may reverse in a posture, whose approach is then unknown."""
+    candidates, planned = planned_bar
     as_chosen = _order_readings(candidates, planned, None)
     unknown = {r.posture for r in as_chosen.readings if "u" in r.conditions.approach}
     assert unknown
@@ -300,6 +307,26 @@ def test_postures_in_which_a_drive_reverses_are_omitted(owned, monkeypatch):
     assert not any("u" in r.conditions.approach for r in plan.readings)
     assert {r.posture for r in plan.readings} == {r.posture for r in as_chosen.readings} - unknown
     assert plan.readings[-1].posture == plan.readings[0].posture
+
+
+def test_postures_whose_path_leaves_the_workspace_are_omitted(planned_bar, monkeypatch):
+    candidates, planned = planned_bar
+    far = [p.name for p in build_session(candidates, planned).postures.values()][3:5]
+    state = planned_session.state_path_approaches
+
+    def with_walls(session):
+        for posture in far:
+            if posture in session.postures:
+                raise UnreachablePathError("wall", setup="bar", posture=posture)
+        return state(session)
+
+    monkeypatch.setattr(planned_session, "state_path_approaches", with_walls)
+    plan = build_session(candidates, planned)
+    assert plan.readings
+    assert not set(far) & set(plan.postures)
+    far[:] = list(candidates.session.postures)
+    with pytest.raises(UnreachablePathError):
+        build_session(candidates, planned)
 
 
 def on_segments(starts, ends, count=101):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
@@ -509,13 +509,15 @@ def _require_paths(
     """Paths to the stops of a setup.
 
     Raises:
-        SessionError: If a path leaves the workspace; names the posture.
+        UnreachablePathError: If a path leaves the workspace; names the posture.
     """
     for stop, path in zip(stops, paths, strict=True):
         if path is None:
-            raise SessionError(
+            raise UnreachablePathError(
                 f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace"
                 f"{remark}",
+                setup=setup,
+                posture=stop.posture,
                 where=str(session.path or "session"),
             )
     return [path for path in paths if path is not None]
