@@ -41,6 +41,9 @@ BLADE = Tip("blade", 0.0, 1.0)
 STATED, REPEATED = "the stated noise of the gauge", "the scatter of repeated readings"
 """Sources of the noise, as noun phrases."""
 
+LARGEST_OVERSTATED = 0.5
+"""Ratio of the residuals to the stated noise below which the latter is reported as too large."""
+
 WORST_FIRST: tuple[FindingKind, ...] = (
     "model error",
     "gauge overstated",
@@ -104,6 +107,14 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
             may_enlarge_model=calibration.only_offsets,
         )
 
+    if (
+        stated is not None
+        and noise.source in ("gauge", "residuals")
+        and noise.exceeds_residuals(stated)
+        and noise.residual_sigma < LARGEST_OVERSTATED * stated
+    ):
+        name = gauge.name if several else ""
+        return words.gauge_overstated(noise.residual_sigma, stated, name)
     if noise.source == "unknown":
         return words.noise_unknown()
     if noise.source == "gauge":
@@ -121,8 +132,6 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
     if noise.exceeded_by_residuals(stated):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
         return excess(stated, f"the stated scatter of {noun}")
-    if noise.exceeds_residuals(stated):
-        return words.gauge_overstated(noise.residual_sigma, stated, gauge.name if several else "")
     return words.fits(noise.residual_sigma, STATED)
 
 

@@ -89,6 +89,10 @@ def three_stated_rows(session):
 
 EXPLAINED = {
     "fits": (lambda c, e: calibrate(_silent(c), **QUICK), {"sigma_mm": 0.0102}),
+    "gauge overstated": (
+        lambda c, e: calibrate(c.with_gauge(replace(c.gauge, sigma=5e-5)), "full", **QUICK),
+        {"ratio": 0.195, "gauge_sigma_mm": 0.05},
+    ),
     "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),
     "model error beside cycles": (lambda c, e: every_time(c), {"ratio": 6.27}),
     "noise from residuals": (lambda c, e: once(c), {}),
