@@ -133,7 +133,9 @@ def find_finer(session: Session) -> Iterator[Finding]:
             step = gauge.resolution or 0.0
             inches = _fit_inches(session.values[rows], step)
             first = _first(session, finer)
-            yield words.finer_than_gauge(len(finer), len(rows), step, *first, inches=inches)
+            yield words.finer_than_gauge(
+                len(finer), len(rows), step, *first, inches=inches, name=_if_several(session, name)
+            )
 
 
 def _fit_inches(values: Array, step: float) -> bool:
@@ -332,7 +334,13 @@ def _check_repeats(session: Session, name: str) -> Finding | None:
         label_reading(session.robot, session.readings[worst[0]]),
         shown,
         [place_of(session, i) for i in worst[:MAX_PLACES]],
+        _if_several(session, name),
     )
+
+
+def _if_several(session: Session, gauge: str) -> str:
+    """Name of a gauge, empty if the session has no other."""
+    return gauge if len(session.gauges) > 1 else ""
 
 
 def _lengths(robot: Robot) -> dict[str, float]:

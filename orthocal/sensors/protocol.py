@@ -21,7 +21,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
-from orthocal.units import Unit
+from orthocal.units import InUnit, Unit
 
 GaugeZero = Literal["free", "known"]
 """Gauge zero of a setup: estimated from its readings, or known to be 0. With a known gauge zero the
@@ -40,7 +40,7 @@ LARGEST_READING = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class NuisanceParameter:
+class NuisanceParameter(InUnit):
     """Error of a sensor or its mounting that is estimated together with the machine."""
 
     name: str

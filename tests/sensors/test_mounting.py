@@ -174,7 +174,7 @@ def test_files_keep_the_mounting(tmp_path):
         (
             {"yx": BLOCK, "zx": f"{BLOCK}, direction_tolerance_mrad: 10"},
             "setups.zx: shares the roll of 'stand.block' with 'yx', which states a tolerance of "
-            "0.02 rad",
+            "20 mrad",
         ),
         ({"zx": ", direction_tolerance_mrad: 900"}, "setups.zx.direction_tolerance_mrad"),
         ({"zx": ", section_tolerance_mm: -1"}, "setups.zx.section_tolerance_mm"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import mm, note, parameter_places, reject, review, times
+from orthocal.assessment.wording import note, parameter_places, reject, review, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.robot.parameters import Parameter
 from orthocal.text import spans
@@ -94,6 +94,11 @@ def above_tolerances(scale: float) -> Finding:
     )
 
 
+def _named(gauge: str) -> str:
+    """Name of one of several gauges after its noun."""
+    return f" '{gauge}'" if gauge else ""
+
+
 def finer_than_gauge(
     count: int,
     total: int,
@@ -103,6 +108,7 @@ def finer_than_gauge(
     places: Sequence[Place],
     *,
     inches: bool,
+    name: str,
 ) -> Finding:
     """Finding about readings between the steps of the gauge.
 
@@ -114,12 +120,14 @@ def finer_than_gauge(
         value: Its value, [m].
         places: Places of all of them.
         inches: Whether all readings of the gauge are multiples of the step if they are in inches.
+        name: Name of the gauge; empty if there is only one.
     """
     first = f"The first is {value / MM:.6g} mm in {where}."
     text, action = (
-        f"{count} of {total} readings are in inches, or have more digits than the gauge shows "
-        f"(resolution {step / MM:g} mm). {first}",
-        "Make sure that the readings are in mm, not in inches, and that the resolution is right.",
+        f"{count} of {total} readings are in inches, or have more digits than the gauge"
+        f"{_named(name)} shows (resolution {step / MM:g} mm). {first}",
+        "Make sure that the readings are in mm, not in inches, and that the resolution is right"
+        f"{', and that each setup names its gauge' if name else ''}.",
     )
     if inches:
         text, action = (
@@ -228,7 +236,7 @@ def legs_differ(legs: str, lengths: dict[str, float]) -> Finding:
 
 
 def scattered_repeats(
-    scatter: float, gauge: float, label: str, shown: str, places: Sequence[Place]
+    scatter: float, gauge: float, label: str, shown: str, places: Sequence[Place], name: str
 ) -> Finding:
     """Finding about repeated readings that differ by far more than the gauge's noise.
 
@@ -238,12 +246,14 @@ def scattered_repeats(
         label: Reading that differs most.
         shown: Its values with their lines.
         places: Places of these values.
+        name: Name of the gauge; empty if there is only one.
     """
     return review(
         "scattered repeats",
-        f"Repeated readings scatter by {mm(scatter)} mm; the gauge alone by {mm(gauge)} mm. They "
-        f"differ most at {label}: {shown}.",
-        "Check these lines for a wrong sign or a wrong line, and read them again.",
+        f"Repeated readings scatter by {scatter / MM:.2g} mm; the gauge{_named(name)} alone by "
+        f"{gauge / MM:.2g} mm as stated. They differ most at {label}: {shown}.",
+        "Check these lines for a wrong sign or a wrong line, and read them again. If they are "
+        "right, state a larger sigma_mm.",
         places,
         scatter_mm=scatter / MM,
         gauge_mm=gauge / MM,

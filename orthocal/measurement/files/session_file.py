@@ -429,9 +429,10 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
             if not parameter.of_gauge and before.sensor.place != setup.sensor.place:
                 problem = f"is mounted at {' '.join(before.sensor.place)}"
             elif other.prior_std != parameter.prior_std:
-                problem = f"states a tolerance of {show_limit(other.prior_std):g} {other.unit}"
+                tolerance = show_limit(other.prior_std) * other.edge_factor
+                problem = f"states a tolerance of {tolerance:g} {other.edge_unit}"
             elif other.nominal != parameter.nominal:
-                problem = f"states {other.nominal:g} {other.unit}"
+                problem = f"states {other.nominal * other.edge_factor:g} {other.edge_unit}"
             else:
                 continue
             raise SessionError(
