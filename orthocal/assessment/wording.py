@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place
+from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place, Severity
 from orthocal.text import capitalised, uncapitalised
 from orthocal.units import MM, UM
 
@@ -19,7 +20,8 @@ ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""
 
 
-def note(
+def _finding(
+    severity: Severity,
     kind: FindingKind,
     text: str,
     action: str = "",
@@ -27,32 +29,18 @@ def note(
     /,
     **numbers: float,
 ) -> Finding:
-    """Finding for information. The names of its numbers end in their units."""
-    return Finding(kind, "note", text, action, numbers, tuple(places))
+    """Finding of a severity. The names of its numbers end in their units."""
+    return Finding(kind, severity, text, action, numbers, tuple(places))
 
 
-def review(
-    kind: FindingKind,
-    text: str,
-    action: str = "",
-    places: Sequence[Place] = (),
-    /,
-    **numbers: float,
-) -> Finding:
-    """Finding after which the user should check the readings."""
-    return Finding(kind, "review", text, action, numbers, tuple(places))
+note = partial(_finding, "note")
+"""Finding for information."""
 
+review = partial(_finding, "review")
+"""Finding after which the user should check the readings."""
 
-def reject(
-    kind: FindingKind,
-    text: str,
-    action: str = "",
-    places: Sequence[Place] = (),
-    /,
-    **numbers: float,
-) -> Finding:
-    """Finding after which the readings must not be used."""
-    return Finding(kind, "reject", text, action, numbers, tuple(places))
+reject = partial(_finding, "reject")
+"""Finding after which the readings must not be used."""
 
 
 def describe_actions(findings: Sequence[Finding]) -> str:

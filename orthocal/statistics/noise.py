@@ -67,7 +67,7 @@ class Noise:
         return floor, math.inf
 
     def scaled(self, factor: float) -> Noise:
-        """The same noise in another unit."""
+        """Noise in another unit; `factor` is the size of the present one."""
         return replace(
             self,
             sigma=self.sigma * factor,
