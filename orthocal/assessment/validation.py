@@ -46,7 +46,7 @@ from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
-from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
+from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
@@ -101,8 +101,8 @@ class Validation:
     """Comparison of a new session with the predictions of a calibration."""
 
     confirmed: bool | None
-    """True if the calibration is confirmed; None if it predicts nothing, or if the new readings
-    agree with it but the sessions have anomalies."""
+    """True if the calibration is confirmed; None if it predicts nothing, if new readings are
+    wrong, or if they agree with it but all readings together show an anomaly."""
     offsets_stated: bool
     """True if the session states the active offsets; otherwise the calibrated ones are assumed."""
     expected_rms: float
@@ -225,13 +225,14 @@ def validate_calibration(
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
     fit, refit = _refit(calibration, join_sessions(measured))
-    all_sessions = join_sessions([restore_session(calibration), *measured])
+    before = restore_session(calibration)
+    all_sessions = join_sessions([before, *measured])
     anomalies = find_anomalies(all_sessions)
     judgement = judge_session(all_sessions, anomalies=anomalies)
     mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     agreement = _describe_agreement(refit, test, expected_rms, judgement)
-    confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
+    confirmed = _confirmation(agreement, judgement, anomalies, n_before=len(before.readings))
     joint, findings = None, judgement.findings
     if confirmed:
         joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
@@ -311,19 +312,31 @@ def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration
     return fit, replace(refit, assessment=assess(refit, session))
 
 
-def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:
+def _confirmation(
+    agreement: Finding, judgement: Judgement, anomalies: Anomalies, *, n_before: int
+) -> bool | None:
     """True if new readings confirm the predictions; None if that is unknown.
+
+    Wrong new readings neither confirm nor contradict a calibration.
 
     Args:
         agreement: Finding about the agreement of the new readings.
         judgement: Judgement of all sessions.
-        changed: Whether a change between the sessions was found.
+        anomalies: Anomalies of all sessions.
+        n_before: Number of readings of the calibration, which precede the new ones.
     """
     if agreement.kind == "nothing predicted":
         return None
-    if agreement.severity != "note" or changed:
+    changed = any(a.explanation.sessions for a in anomalies.found)
+    if changed or (agreement.severity != "note" and not _are_in_rows(anomalies, n_before)):
         return False
     return True if judgement.verdict == "enter" else None
+
+
+def _are_in_rows(anomalies: Anomalies, first: int) -> bool:
+    """True if there are anomalies, and each of them is one of rows from `first` on."""
+    found = [e for a in anomalies.found for e in (a.explanation, *a.causes, *a.alternatives)]
+    return bool(found) and all(e.rows and min(e.rows) >= first for e in found)
 
 
 def _calibrate_jointly(
@@ -493,8 +506,9 @@ def _decide(
 ) -> ValidationDecision:
     """Decision about a validation, with the verdict on all sessions.
 
-    Its reason states the agreement and the findings that decide, those first if the deviations are
-    as predicted. Its action is that of these findings, otherwise that of the agreement.
+    Its reason states what decides: deviations that are not as predicted, then the findings about
+    the readings; if there is neither, the agreement. Wrong readings explain deviations, which are
+    therefore not stated. Its action is that of these findings, otherwise that of the agreement.
 
     Args:
         confirmed: Whether the calibration is confirmed; None if unknown.
@@ -502,12 +516,13 @@ def _decide(
         agreement: Finding about the agreement of the new readings.
     """
     against = [f for f in findings if f.severity != "note"]
-    reasons = [agreement, *against] if agreement.severity != "note" else [*against, agreement]
+    explained = bool(against) and confirmed is None and agreement.kind == "larger than predicted"
+    reasons = against if explained else [f for f in (agreement, *against) if f.severity != "note"]
     headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
     return ValidationDecision(
         verdict_of(against),
         headlines[confirmed],
-        join_texts([f.text for f in reasons]),
+        join_texts([f.text for f in reasons or [agreement]]),
         describe_actions(against) or agreement.action,
         confirmed,
     )

@@ -449,6 +449,23 @@ def test_values_from_readings_with_a_mistake_are_not_entered(plan):
     assert result.assessment.decision.verdict == checked.decision.verdict == "review"
 
 
+def test_a_wrong_new_reading_makes_a_validation_inconclusive(plan):
+    """The answer names it and says nothing of deviations that it causes."""
+    errors, _, calibration = calibrated_machine("raw-cycles", None, 0)
+    entered = plan.with_controller(entered_offsets(calibration))
+    session = simulate_session(entered, errors, seed=2).session
+    assert validate_calibration(calibration, session).confirmed
+    wrong = session.with_values(session.values + 0.3e-3 * (np.arange(len(session.values)) == 4))
+    result = validate_calibration(calibration, wrong)
+    assert result.confirmed is None
+    assert result.as_expected is False
+    (outlier,) = result.assessment.of_kind("outlier")
+    assert result.assessment.decision.reason == outlier.text
+    assert result.assessment.of_kind("larger than predicted")
+    assert result.assessment.decision.exit_code == 3
+    assert_nothing_new_to_enter(result)
+
+
 def test_an_inconclusive_validation_states_reason_and_next_step_only(plan):
     """The new readings agree, but the earlier session has an anomaly."""
     rows = simulate_session(plan, TRUTH, seed=1).session
