@@ -569,8 +569,11 @@ def test_again_repeats_the_last_of_several_sessions(days, tmp_path):
     words = ["again", days[0] / "out", "--anyway", "--out"]
     code, _, err = orthocal(*words, tmp_path / "next")
     assert code == 0, err
+    named = "The readings are those of the last session, "
+    assert f"{named}{days[0] / 'tuesday/session.yaml'}; --session" in err
     code, _, err = orthocal(*words, tmp_path / "chosen", "--session", days[0] / "tuesday")
     assert code == 0, err
+    assert named not in err
     rows = [(tmp_path / name / "readings.csv").read_text() for name in ("next", "chosen")]
     assert rows[0] == rows[1]
 

@@ -85,6 +85,10 @@ def again(
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
     if order := note_wrong_order(result):
         put_note(order)
+    if session is None and (parts := result.session.parts):
+        put_note(
+            f"The readings are those of the last session, {parts[-1].path}; --session names another."
+        )
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
