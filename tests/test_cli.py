@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 import shutil
 
@@ -167,7 +168,8 @@ def test_again_writes_the_same_plan_with_active_offsets(calibrated, experiment, 
     assert (second.title, second.source) == (first.title, "")
     assert "x_slide -0.527 mm" in text
     assert f"orthocal validate {calibrated} {out}" in text
-    assert (out / "sheet.html").read_text().startswith("<!DOCTYPE html>")
+    validated = f"<code>orthocal validate {os.path.relpath(calibrated, out)} .</code>"
+    assert validated in (out / "sheet.html").read_text()
     code, _, err = orthocal("again", calibrated, "--out", out)
     assert code == 2
     assert err == f"orthocal: {out}/session.yaml: exists already; --force overwrites it\n"

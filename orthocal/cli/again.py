@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +80,8 @@ def again(
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
     )
-    sheet, problem = sheet_or_problem(new, calibration=os.path.relpath(calibration, out))
+    validated = shlex.quote(os.path.relpath(calibration, out))
+    sheet, problem = sheet_or_problem(new, following=f"orthocal validate {validated} .")
     if problem:
         put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
@@ -87,7 +89,8 @@ def again(
         put_note(order)
     if session is None and (parts := result.session.parts):
         put_note(
-            f"The readings are those of the last session, {parts[-1].path}; --session names another."
+            f"The readings are those of the last session, {parts[-1].path}; --session names "
+            "another one."
         )
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())

@@ -113,6 +113,7 @@ def plan(
     Args:
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
     """
+    from orthocal.output.text.answer import calibrate_command, quote_path
     from orthocal.output.text.plan import describe_assumed_tip, plan_json
     from orthocal.output.text.summary import print_summary
     from orthocal.planning.expected_error import CRITERIA
@@ -131,9 +132,13 @@ def plan(
     if assumed := describe_assumed_tip(chosen.equipment, chosen.session):
         put_note(assumed)
     if out is not None:
+        sessions = [Path(subject), out] if chosen.complements else [out]
+        stated = options.tolerance and chosen.complements
+        tolerances = chosen.session.robot.parameters.stated if stated else {}
         with worker_budget(workers):
-            _write(chosen, out)
-        put_note(_describe_next(subject, chosen, out, stated=bool(options.tolerance)))
+            _write(chosen, out, calibrate_command(sessions, tolerances, folder=out))
+        calibrating = calibrate_command(sessions, tolerances)
+        put_note(f"Next:\n  orthocal record {quote_path(out)}\n  {calibrating}")
     elif not json:
         put_note("Nothing was written; --out DIRECTORY writes session, sheet and programs.")
 
@@ -185,24 +190,6 @@ def _choose(
     return replace(plan, session=replace(plan.session, compensation=compensation))
 
 
-def _describe_next(subject: str, plan: orthocal.MeasuringPlan, out: Path, *, stated: bool) -> str:
-    """Next commands: record the readings, and calibrate with those that they complement.
-
-    Args:
-        subject: Robot, or session that the plan complements.
-        plan: The plan.
-        out: Directory of the plan.
-        stated: True if the tolerances are those of an option.
-    """
-    from orthocal.output.text.answer import calibrate_command, quote_path
-
-    sessions = [Path(subject), out] if plan.complements else [out]
-    tolerances = plan.session.robot.parameters.stated if stated and plan.complements else {}
-    return (
-        f"Next:\n  orthocal record {quote_path(out)}\n  {calibrate_command(sessions, tolerances)}"
-    )
-
-
 def _missing_controller(session: orthocal.Session) -> str:
     """Lines about keys of the controller that a session does not state; "" if it states all."""
     drives = session.robot.drives
@@ -220,8 +207,14 @@ def _missing_controller(session: orthocal.Session) -> str:
     return f"{head}:\ncontroller: {{{', '.join(keys)}}}\n"
 
 
-def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
-    """Write a plan as a session with its sheet and its figure."""
+def _write(plan: orthocal.MeasuringPlan, directory: Path, calibrating: str) -> None:
+    """Write a plan as a session with its sheet and its figure.
+
+    Args:
+        plan: The plan.
+        directory: The directory.
+        calibrating: Command that calibrates from the readings, in this directory.
+    """
     from orthocal.output.text.plan import draw_plan, plan_json
     from orthocal.runtime.worker_pool import call_in_parallel
     from orthocal.sensors.protocol import tool_path
@@ -232,13 +225,13 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     side = "as the column approach states" if stated else side
     comment = (
         "A plan: run `orthocal record .` in this directory, or fill in readings.csv; then\n"
-        "orthocal calibrate .\n"
+        f"{calibrating}\n"
         f"{_missing_controller(plan.session)}"
         f"Approach every posture {side}. The last reading of a setup is its first\n"
         "posture again."
     )
     (sheet, problem), figure = call_in_parallel(
-        [lambda: sheet_or_problem(plan.session), lambda: draw_plan(plan)],
+        [lambda: sheet_or_problem(plan.session, following=calibrating), lambda: draw_plan(plan)],
         killed="a process that drew the plan was killed",
     )
     if problem:

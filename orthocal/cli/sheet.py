@@ -52,12 +52,17 @@ def sheet(
 
 
 def sheet_or_problem(
-    session: orthocal.Session, *, calibration: str = "CALIBRATION"
+    session: orthocal.Session, *, following: str = ""
 ) -> tuple[dict[str, str], str]:
-    """Text of the files of the measuring sheet by name, or no files and the reason."""
+    """Text of the files of the measuring sheet by name, or no files and the reason.
+
+    Args:
+        session: The plan.
+        following: Command for the readings; see `sheet_files`.
+    """
     from orthocal.output.sheet.page import sheet_files
 
     try:
-        return sheet_files(session, calibration=calibration), ""
+        return sheet_files(session, following=following), ""
     except OrthocalError as e:
         return {}, f"orthocal: no measuring sheet: {e}"

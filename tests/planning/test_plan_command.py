@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -168,6 +169,9 @@ def test_further_setups_of_a_session_are_planned(root, tmp_path):
     assert document["expected"]["aligned_um"] < document["before"]["aligned_um"]
     calibrating = ["orthocal", "calibrate", str(session), str(out), *option]
     assert shlex.split(err.splitlines()[-1]) == [*calibrating, "--out", f"{out}-calibration"]
+    inside = f"orthocal calibrate {os.path.relpath(session, out)} . {shlex.join(option)}"
+    assert f"<code>{inside}</code>" in html.unescape((out / "sheet.html").read_text())
+    assert f"# {inside}\n" in (out / "session.yaml").read_text()
     printed = " ".join(text.split())
     words = r"([\d.]+) mm with these readings added, ([\d.]+) mm with those of the session alone"
     after, before = map(float, re.search(words, printed).groups())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Collection, Sequence
 from importlib import resources
 
@@ -91,14 +90,15 @@ VISIBLE = 5e-5
 
 
 def sheet_files(
-    session: Session, *, options: ProgramOptions | None = None, calibration: str = "CALIBRATION"
+    session: Session, *, options: ProgramOptions | None = None, following: str = ""
 ) -> dict[str, str]:
     """The sheet of a plan and one program per setup, as a mapping of file name to text.
 
     Args:
         session: The plan, or a session.
         options: Feeds and shift of the programs.
-        calibration: Path of the calibration whose offsets are active, from the sheet's directory.
+        following: Command for the readings, in the directory of the sheet; by default `calibrate`,
+            or `validate` if the controller has offsets of a calibration.
 
     Raises:
         SessionError: If the machine cannot go through the plan.
@@ -122,8 +122,9 @@ def sheet_files(
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
     front = _front(session, motions, options, with_programs=bool(programs))
-    following = f"validate {shlex.quote(calibration)}" if _is_corrected(session) else "calibrate"
-    body = "\n".join([front, "".join(setups), _afterwards(session, f"orthocal {following} .")])
+    usual = "validate CALIBRATION ." if _is_corrected(session) else "calibrate ."
+    afterwards = _afterwards(session, following or f"orthocal {usual}")
+    body = "\n".join([front, "".join(setups), afterwards])
     return {SHEET: page(title, style, body), **programs}
 
 

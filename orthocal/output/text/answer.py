@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -281,16 +282,22 @@ def gains_from_correction(calibration: Calibration) -> bool:
     )
 
 
-def calibrate_command(sessions: Sequence[Path], tolerances: Mapping[str, float]) -> str:
+def calibrate_command(
+    sessions: Sequence[Path], tolerances: Mapping[str, float], *, folder: Path | None = None
+) -> str:
     """Command that calibrates from several sessions.
 
     Args:
         sessions: Directories of the sessions.
         tolerances: Tolerances that differ from those of the robot, by their keys.
+        folder: Directory in which the command is typed, if it is that of a session. It is then
+            without --out.
     """
-    names = [quote_path(session) for session in sessions]
+    paths = sessions if folder is None else [os.path.relpath(s, folder) for s in sessions]
+    names = [quote_path(path) for path in paths]
     options = [f"--tolerance {quote_path(f'{key}={value:g}')}" for key, value in tolerances.items()]
-    return " ".join(["orthocal calibrate", *names, *options, f"--out {names[-1]}-calibration"])
+    out = [f"--out {names[-1]}-calibration"] if folder is None else []
+    return " ".join(["orthocal calibrate", *names, *options, *out])
 
 
 def quote_path(path: str | Path) -> str:
