@@ -4,8 +4,8 @@ Passive joints and gauge zeros are eliminated. About the present θ the problem 
 a robust loss. This subproblem is solved completely, within the bounds. The passive joints follow
 the step to first order. If the loops remain nearly closed and the objective decreases, their
 opening is corrected in the next step. Otherwise the loops are closed and the step is halved until
-the objective decreases. A step that reverses most of the last one is relaxed. The optimum is that
-of the complete program, which Ipopt solves.
+the objective decreases. Steps are accelerated by Anderson's method (`_Acceleration`). The optimum is
+that of the complete program, which Ipopt solves.
 
 From start values far from the optimum, the first steps can be so long that they end in a local
 minimum. If the result is far from its prior, or the solver does not converge, the problem is solved
@@ -40,11 +40,8 @@ RELAXATIONS = (16.0, 4.0, 1.0)
 MAX_HALVINGS = 12
 """Largest number of halvings of a step."""
 
-OVERSHOOT = 0.5
-"""Largest part of a step that the next step may reverse without being relaxed."""
-
-MIN_SHARE = 0.1
-"""Smallest part of a relaxed step."""
+MEMORY = 4
+"""Number of earlier steps that accelerate a step."""
 
 MAX_MIRRORED_ITERATIONS = 30
 """Largest number of iterations from a mirror image; those that need more rarely converge."""
@@ -155,27 +152,26 @@ class VariableProjection(Program):
             SolverError: If the solver does not converge.
             ClosureError: If the solution cannot reach a posture.
         """
-        sizes, before, share = np.full(3, np.inf), None, 1.0
+        sizes, acceleration = np.full(3, np.inf), _Acceleration()
         state, linear = begin
         for iterations in range(1, max_iterations + 1):
             jacobian = linear.jacobian
             jacobian /= task.sigma  # in place: it may be large, and is not used again
             step = task.step(state, jacobian)
             sizes = np.r_[np.abs(step).max(initial=0.0), sizes[:2]]
-            share = _relax(step, before, share)
-            before, step = step, share * step
+            accelerated = acceleration.accelerate(state.theta, step)
             if follow and have_converged(sizes):
-                theta = np.clip(state.theta + step, task.low, task.high)
+                theta = np.clip(state.theta + accelerated, task.low, task.high)
                 passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
-            followed = self._follow(task, state, linear, step) if follow else None
+            followed = None
+            for trial in (accelerated, step) if follow else ():
+                followed = followed or self._follow(task, state, linear, trial)
             if followed is not None:
                 state, linear = followed
                 continue
-            length = np.abs(step).max(initial=0.0)
             state, step = self._move(task, state, step)
             sizes[0] = np.abs(step).max(initial=0.0)
-            share *= sizes[0] / length if length else 1.0
             if have_converged(sizes):
                 return state, jacobian, iterations
             linear = task.linearise(state.theta, state.passive)
@@ -243,24 +239,32 @@ def have_converged(sizes: Array) -> Mask:
         )
 
 
-def _relax(step: Array, before: Array | None, share: float) -> float:
-    """Relaxation factor of a Gauss-Newton step, below 1 if the last step went too far (Aitken).
+class _Acceleration:
+    """Anderson's acceleration of fixed-point iterations (Walker and Ni, SIAM J. Numer. Anal., 2011).
 
-    The Gauss-Newton method neglects the curvature of readings. Some parameters change readings only
-    to second order, such as the position of a fixed ball across the plane of motion. Along them
-    steps alternate and may not become shorter.
-
-    Args:
-        step: The step, shape (n_free,), [prior std].
-        before: The last step without relaxation, shape (n_free,), [prior std]; None at the start.
-        share: Relaxation factor of the last step.
+    The Gauss-Newton method neglects the curvature of readings, so that its steps become shorter by
+    a constant factor only. Along parameters that change readings to second order, such as the
+    position of a fixed ball across the plane of motion, they may alternate.
     """
-    if before is None:
-        return 1.0
-    if share == 1.0 and not step @ before < -OVERSHOOT * (before @ before):
-        return 1.0
-    change = before - step
-    return float(np.clip(share * (before @ change) / (change @ change), MIN_SHARE, 1.0))
+
+    def __init__(self) -> None:
+        self._points: list[Array] = []
+        self._steps: list[Array] = []
+
+    def accelerate(self, theta: Array, step: Array) -> Array:
+        """Step from θ̂ that leads to the point at which the steps vanish to first order.
+
+        Args:
+            theta: θ̂, shape (n_free,).
+            step: Gauss-Newton step from there, shape (n_free,), [prior std].
+        """
+        self._points = [*self._points[-MEMORY:], theta]
+        self._steps = [*self._steps[-MEMORY:], step]
+        if len(self._steps) == 1:
+            return step
+        of_steps, of_points = (np.diff(np.array(a), axis=0).T for a in (self._steps, self._points))
+        shares = np.linalg.lstsq(of_steps, step, rcond=None)[0]
+        return np.asarray(step - (of_steps + of_points) @ shares)
 
 
 def _is_not_worse(trial: Iterate, state: Iterate) -> bool:
