@@ -194,9 +194,11 @@ def _by_model(
     """Findings about deviations before a fit, and about residuals of a fit of offsets."""
     try:
         yield _dimensions(session, problem)
-        if not fit:
+        if not fit or len(session.gauges) > 1:
             return
-        fitted = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
+        # one solution: if its residuals are below the stated noise, sigma is the stated one
+        options = SolverOptions(solver="variable-projection")
+        fitted = fit_problem(problem, options=options, rounds=1)
     except (OrthocalError, np.linalg.LinAlgError):
         return  # other findings report readings that no machine can cause
     yield _too_small(session, fitted)
@@ -229,9 +231,9 @@ def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None
 
 
 def _too_small(session: Session, fit: Fit) -> Finding | None:
-    """Finding about residuals that are smaller than the rounding to steps of the gauge."""
+    """Finding about residuals that are smaller than the rounding to steps of the only gauge."""
     step, noise = session.gauge.resolution, fit.noise
-    if not step or len(session.gauges) > 1:
+    if not step:
         return None
     observations = fit.problem.observations
     parameters_used = observations.size - observations.n_zeros - noise.residual_dof
@@ -244,9 +246,12 @@ def _too_small(session: Session, fit: Fit) -> Finding | None:
 
 
 def _coarse(session: Session, fit: Fit) -> Finding | None:
-    """Finding about a stated noise far above the scatter of repeated readings, or the residuals."""
+    """Finding about a stated noise of the only gauge far above the scatter of repeated readings.
+
+    Without repetitions it is compared with the residuals.
+    """
     stated, noise = session.gauge.sigma, fit.noise
-    if stated is None or len(session.gauges) > 1:
+    if stated is None:
         return None
     repeated = noise.cycles_dof >= MIN_DOF
     scatter = noise.cycles_sigma if repeated else noise.residual_sigma

@@ -71,7 +71,7 @@ class Fit:
     iterations: int
     """Iterations of the solver in all solutions."""
     noise_converged: bool
-    """False if sigma or a noise ratio still changed after `MAX_SIGMA_ROUNDS` solutions."""
+    """False if sigma or a noise ratio still changed in the last solution."""
     linearisation: LinearProblem
     """Problem linearised about the active offsets of the controller."""
     linearised_theta: Array
@@ -202,6 +202,7 @@ def fit_problem(
     options: SolverOptions | None = None,
     start: ArrayLike | None = None,
     program: Program | None = None,
+    rounds: int = MAX_SIGMA_ROUNDS,
 ) -> Fit:
     """Solve a problem, with sigma from the readings if they determine it.
 
@@ -211,6 +212,8 @@ def fit_problem(
         start: Start values of the free parameters, shape (n_free,), [SI]; the only start that is
             tried. By default the linearised solution, then the active offsets.
         program: Program of the same problem with other readings, instead of `options`.
+        rounds: Largest number of solutions until sigma and the noise ratios agree with the
+            residuals.
 
     Raises:
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
@@ -228,7 +231,7 @@ def fit_problem(
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
-    solved = _solve_with_noise(program, linear, groups, start)
+    solved = _solve_with_noise(program, linear, groups, start, rounds=rounds)
     program, linear, noises = solved.program, solved.linear, solved.evaluation.noises
     require_assembly(program.problem, solved.solution, options=program.options)
     sigma = floored_sigma(noises.common)
@@ -270,6 +273,8 @@ def _solve_with_noise(
     linear: LinearProblem,
     groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
+    *,
+    rounds: int,
 ) -> _NoiseSolution:
     """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
@@ -277,7 +282,7 @@ def _solve_with_noise(
     several = len(groups) > 1
     solution, sigma = _solve_first(program, linear, groups, start)
     iterations, compared = solution.iterations, True
-    for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
+    for remaining in reversed(range(rounds)):
         evaluation = _evaluate(program, solution, sigma, groups, initial)
         estimated, ratio = floored_sigma(evaluation.noises.common), evaluation.noises.ratio
         change = estimated / sigma * (ratio / problem.noise_ratio)

@@ -20,7 +20,6 @@ from orthocal import (
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.calibration.identify import identify
 from orthocal.errors import SessionError
-from orthocal.estimation import fit as fit_module
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
@@ -206,14 +205,13 @@ def test_only_sessions_of_one_robot_are_joined(root):
     assert join_sessions(sessions) is sessions[0]
 
 
-def test_a_fit_is_of_one_problem_where_the_noise_does_not_settle(root, monkeypatch):
+def test_a_fit_is_of_one_problem_where_the_noise_does_not_settle(root):
     """The noise ratio of the last solution, not of one that nobody has solved."""
-    monkeypatch.setattr(fit_module, "MAX_SIGMA_ROUNDS", 1)
     plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
     sessions = [simulate_session(plan, TRUTH, seed=s, sigma=s * 10e-6).session for s in (1, 4)]
     once = [replace(s, readings=tuple(r for r in s.readings if r.cycle == 1)) for s in sessions]
-    fit = fit_problem(build_problem(join_sessions(once), model="offsets"))
+    fit = fit_problem(build_problem(join_sessions(once), model="offsets"), rounds=1)
     prediction = fit.problem.predict(fit.solution.theta, fit.solution.passive)
     assert fit.prediction == pytest.approx(prediction, rel=1e-12)
     assert fit.program.problem is fit.problem

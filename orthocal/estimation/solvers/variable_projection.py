@@ -4,8 +4,8 @@ Passive joints and gauge zeros are eliminated. About the present θ the problem 
 a robust loss. This subproblem is solved completely, within the bounds. The passive joints follow
 the step to first order. If the loops remain nearly closed and the objective decreases, their
 opening is corrected in the next step. Otherwise the loops are closed and the step is halved until
-the objective decreases. Steps are accelerated by Anderson's method (`_Acceleration`). The optimum is
-that of the complete program, which Ipopt solves.
+the objective decreases. Steps are accelerated by Anderson's method (`_Acceleration`). The optimum
+is that of the complete program, which Ipopt solves.
 
 From start values far from the optimum, the first steps can be so long that they end in a local
 minimum. If the result is far from its prior, or the solver does not converge, the problem is solved
@@ -240,7 +240,7 @@ def have_converged(sizes: Array) -> Mask:
 
 
 class _Acceleration:
-    """Anderson's acceleration of fixed-point iterations (Walker and Ni, SIAM J. Numer. Anal., 2011).
+    """Anderson's acceleration of fixed-point iterations (Walker and Ni, SIAM J. Numer. Anal. 2011).
 
     The Gauss-Newton method neglects the curvature of readings, so that its steps become shorter by
     a constant factor only. Along parameters that change readings to second order, such as the

@@ -24,7 +24,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.linearised import LinearisedProgram
-from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.estimation.solvers.variable_projection import VariableProjection, _Acceleration
 
 AGREED = 1e-6
 """Largest difference of two solvers' parameters, [prior std]."""
@@ -235,3 +235,13 @@ def test_a_start_at_which_the_tip_misses_the_rod_is_refused():
     start[problem.free.index("z_slide.offset")] = 25e-3
     with pytest.raises(SolverError, match="cannot start: with the start values of the errors"):
         VariableProjection(problem).solve(sigma=1e-5, start=start)
+
+
+def test_acceleration_ends_linear_iterations_after_as_many_steps_as_parameters():
+    """Steps that become shorter by these factors alone would take hundreds of iterations."""
+    ratios, optimum = np.array([-0.9, 0.5, 0.95]), np.array([3.0, -2.0, 1.0])
+    theta, acceleration = np.zeros(3), _Acceleration()
+    for _ in range(5):
+        step = (1.0 - ratios) * (optimum - theta)
+        theta = theta + acceleration.accelerate(theta, step)
+    assert theta == pytest.approx(optimum, abs=1e-9)
