@@ -14,6 +14,7 @@ import pytest
 from calibrated import plan_of, session_of
 from commands import orthocal as run
 from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_session
+from planned import quick_plan
 
 from orthocal import (
     Orthoglide,
@@ -135,6 +136,25 @@ def test_closing_reading_is_no_cycle_of_its_own(cycles, closing):
     families = wrong_units_and_signs(Rows(cycles.select(rows)), cycles.gauge.sigma)
     scopes = {f.explain(h).scope for f in families for h in range(f.count)}
     assert ("cycle" in scopes) == (closing > 1)
+
+
+@pytest.mark.parametrize(
+    ("seed", "row", "kind"), [(0, 5, "swapped rows"), (3, 6, "inconsistent posture")]
+)
+def test_a_reading_swapped_with_the_closing_one_is_named(seed, row, kind):
+    """Beside it, the reading may also have been missed."""
+    plan = quick_plan().session
+    errors = draw_errors(plan.robot, ["*"], seed=0)
+    sound = simulate_session(plan, errors, seed=seed).session
+    closing = 7
+    one, other = sound.readings[row], sound.readings[closing]
+    assert (one.setup, other.cycle) == (other.setup, 2)
+    values = sound.values.copy()
+    values[[row, closing]] = values[[closing, row]]
+    (found,) = anomalies(sound.with_values(values))
+    assert found.kind == kind
+    assert {p.posture for p in found.places} == {one.posture, other.posture}
+    assert f"{one.setup} {one.posture} and {other.setup} {other.posture}" in found.text
 
 
 def test_a_sigma_in_a_wrong_unit_is_the_only_finding(cycles):

@@ -72,13 +72,19 @@ def _rows(one: int, other: int) -> Explanation:
 
 
 def _of_setup(rows: Rows) -> list[Explanation]:
-    """Pairs of rows of a setup and cycle."""
+    """Pairs of rows of a setup and cycle, and of its closing reading with the others."""
     neighbours_only = rows.count > MAX_ROWS_FOR_ALL_PAIRS
-    return [
-        _rows(i, j)
+    pairs = [
+        (i, j)
         for indices in rows.cycles.values()
         for i, j in (pairwise(indices) if neighbours_only else combinations(indices, 2))
     ]
+    for (setup, _), indices in rows.cycles.items():
+        if indices.size == 1 and not neighbours_only:
+            (closing,) = indices
+            others = (i for i in rows.setups[setup] if rows.posture(i) != rows.posture(closing))
+            pairs += [(i, closing) for i in others if i < closing]
+    return [_rows(i, j) for i, j in pairs]
 
 
 def _across_setups(rows: Rows) -> list[Explanation]:
