@@ -164,8 +164,9 @@ class VariableProjection(Program):
                 theta = np.clip(state.theta + accelerated, task.low, task.high)
                 passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
+            trials = [step] if accelerated is step else [accelerated, step]
             followed = None
-            for trial in (accelerated, step) if follow else ():
+            for trial in trials if follow else []:
                 followed = followed or self._follow(task, state, linear, trial)
             if followed is not None:
                 state, linear = followed
