@@ -225,20 +225,19 @@ def validate_calibration(
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
     fit, refit = _refit(calibration, join_sessions(measured))
-    before = restore_session(calibration)
-    all_sessions = join_sessions([before, *measured])
+    all_sessions = join_sessions([restore_session(calibration), *measured])
     anomalies = find_anomalies(all_sessions)
     judgement = judge_session(all_sessions, anomalies=anomalies)
     mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     agreement = _describe_agreement(refit, test, expected_rms, judgement)
-    confirmed = _confirmation(agreement, judgement, anomalies, n_before=len(before.readings))
+    n_before = len(all_sessions.readings) - len(fit.problem.session.readings)
+    confirmed = _confirmation(agreement, judgement, anomalies, n_before=n_before)
     joint, findings = None, judgement.findings
     if confirmed:
         joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
         confirmed = joint is not None
-    wrongly = _is_wrongly_entered(all_sessions, mistake)
-    entries, notes = _choose_entries(calibration, joint, wrongly_entered=wrongly)
+    entries, notes = _choose_entries(calibration, joint, all_sessions, mistake)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, stated=stated)
@@ -466,7 +465,10 @@ def _describe_agreement(
 
 
 def _choose_entries(
-    calibration: Calibration, joint: Calibration | None, *, wrongly_entered: bool
+    calibration: Calibration,
+    joint: Calibration | None,
+    all_sessions: Session,
+    mistake: Anomaly | None,
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
     """Values to enter after the new readings, and findings about them.
 
@@ -475,10 +477,12 @@ def _choose_entries(
     Args:
         calibration: The validated calibration.
         joint: Joint calibration; None if the calibration is not confirmed.
-        wrongly_entered: Whether the offsets of the calibration were entered wrongly.
+        all_sessions: All sessions.
+        mistake: Change between the sessions; None without any.
     """
     if joint is None:
-        return (find_entries(calibration) if wrongly_entered else ()), []
+        wrongly = _is_wrongly_entered(all_sessions, mistake)
+        return (find_entries(calibration) if wrongly else ()), []
     assessment, findings = assessment_of(joint), _find_further_change(joint)
     entries = assessment.entries if findings else find_entries(calibration)
     return entries, [*findings, *assessment.of_kind(*ENTRY_KINDS)]

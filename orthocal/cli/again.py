@@ -87,11 +87,6 @@ def again(
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
     if order := note_wrong_order(result):
         put_note(order)
-    if session is None and (parts := result.session.parts):
-        put_note(
-            f"The readings are those of the last session, {parts[-1].path}; --session names "
-            "another one."
-        )
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
@@ -237,6 +232,7 @@ def _plan_again(
                 where="--session",
             )
         path = last
+        put_note(f"The readings are those of the last session, {last}; --session names another.")
     if path is not None:
         planned = orthocal.load_plan(path)
         require_calibrated_robot(calibration, planned)
