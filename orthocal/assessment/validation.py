@@ -230,9 +230,9 @@ def validate_calibration(
     judgement = judge_session(all_sessions, anomalies=anomalies)
     mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
-    agreement = _describe_agreement(refit, test, expected_rms, judgement)
-    n_before = len(all_sessions.readings) - len(fit.problem.session.readings)
-    confirmed = _confirmation(agreement, judgement, anomalies, n_before=n_before)
+    explained = _are_in_new_rows(anomalies, all_sessions, fit.problem.session)
+    agreement = _describe_agreement(refit, test, expected_rms, judgement, explained=explained)
+    confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = None, judgement.findings
     if confirmed:
         joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
@@ -311,29 +311,24 @@ def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration
     return fit, replace(refit, assessment=assess(refit, session))
 
 
-def _confirmation(
-    agreement: Finding, judgement: Judgement, anomalies: Anomalies, *, n_before: int
-) -> bool | None:
+def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:
     """True if new readings confirm the predictions; None if that is unknown.
-
-    Wrong new readings neither confirm nor contradict a calibration.
 
     Args:
         agreement: Finding about the agreement of the new readings.
         judgement: Judgement of all sessions.
-        anomalies: Anomalies of all sessions.
-        n_before: Number of readings of the calibration, which precede the new ones.
+        changed: Whether a change between the sessions was found.
     """
     if agreement.kind == "nothing predicted":
         return None
-    changed = any(a.explanation.sessions for a in anomalies.found)
-    if changed or (agreement.severity != "note" and not _are_in_rows(anomalies, n_before)):
+    if agreement.severity != "note" or changed:
         return False
     return True if judgement.verdict == "enter" else None
 
 
-def _are_in_rows(anomalies: Anomalies, first: int) -> bool:
-    """True if there are anomalies, and each of them is one of rows from `first` on."""
+def _are_in_new_rows(anomalies: Anomalies, all_sessions: Session, new: Session) -> bool:
+    """True if there are anomalies, and each of them is one of new rows, which are the last."""
+    first = len(all_sessions.readings) - len(new.readings)
     found = [e for a in anomalies.found for e in (a.explanation, *a.causes, *a.alternatives)]
     return bool(found) and all(e.rows and min(e.rows) >= first for e in found)
 
@@ -428,7 +423,12 @@ def _is_wrongly_entered(all_sessions: Session, mistake: Anomaly | None) -> bool:
 
 
 def _describe_agreement(
-    refit: Calibration, test: DeviationTest, expected: float, judgement: Judgement
+    refit: Calibration,
+    test: DeviationTest,
+    expected: float,
+    judgement: Judgement,
+    *,
+    explained: bool,
 ) -> Finding:
     """Finding about the agreement of the deviations with their prediction.
 
@@ -436,7 +436,9 @@ def _describe_agreement(
         refit: Fit of the new readings, assessed.
         test: Test of the deviations.
         expected: Predicted RMS of the deviations, [m].
-        judgement: Judgement of all sessions; its anomalies explain the deviations.
+        judgement: Judgement of all sessions.
+        explained: Whether wrong new readings explain the deviations. These neither confirm nor
+            contradict the calibration.
     """
     achieved = refit.rms_before
     limit = test.critical_factor * achieved
@@ -452,7 +454,7 @@ def _describe_agreement(
         return words.nothing_predicted(numbers)
     if not as_expected:
         worst = max(refit.residuals, key=lambda r: abs(r.deviation))
-        return words.larger_than_predicted(
+        finding = words.larger_than_predicted(
             achieved,
             limit,
             refit.rms_after if judgement.verdict == "enter" else None,
@@ -461,6 +463,7 @@ def _describe_agreement(
             numbers=numbers,
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
+        return replace(finding, severity="note") if explained else finding
     return words.as_predicted(achieved, limit, numbers)
 
 
@@ -511,8 +514,8 @@ def _decide(
     """Decision about a validation, with the verdict on all sessions.
 
     Its reason states what decides: deviations that are not as predicted, then the findings about
-    the readings; if there is neither, the agreement. Wrong readings explain deviations, which are
-    therefore not stated. Its action is that of these findings, otherwise that of the agreement.
+    the readings; if there is neither, the agreement. Its action is that of these findings,
+    otherwise that of the agreement.
 
     Args:
         confirmed: Whether the calibration is confirmed; None if unknown.
@@ -520,8 +523,7 @@ def _decide(
         agreement: Finding about the agreement of the new readings.
     """
     against = [f for f in findings if f.severity != "note"]
-    explained = bool(against) and confirmed is None and agreement.kind == "larger than predicted"
-    reasons = against if explained else [f for f in (agreement, *against) if f.severity != "note"]
+    reasons = [f for f in (agreement, *against) if f.severity != "note"]
     headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
     return ValidationDecision(
         verdict_of(against),

@@ -461,7 +461,9 @@ def test_a_wrong_new_reading_makes_a_validation_inconclusive(plan):
     assert result.as_expected is False
     (outlier,) = result.assessment.of_kind("outlier")
     assert result.assessment.decision.reason == outlier.text
-    assert result.assessment.of_kind("larger than predicted")
+    (larger,) = result.assessment.of_kind("larger than predicted")
+    assert larger.severity == "note"
+    assert larger.text not in summarize(result)
     assert result.assessment.decision.exit_code == 3
     assert_nothing_new_to_enter(result)
 

@@ -35,6 +35,8 @@ from orthocal.output.text.layout import (
 from orthocal.units import MM
 
 DETAILS: tuple[FindingKind, ...] = (
+    "as predicted",
+    "larger than predicted",
     "must change",
     "not significant",
     "no change",
@@ -42,7 +44,7 @@ DETAILS: tuple[FindingKind, ...] = (
     "repetition unknown",
     "residuals differ",
 )
-"""Kinds of findings that are printed only with all readings."""
+"""Kinds of findings that are printed only with all readings, unless they decide."""
 
 
 MORE = "--details prints deviations and all readings."
