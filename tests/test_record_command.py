@@ -132,7 +132,7 @@ def test_session_with_active_offsets_is_to_be_validated(folder, run):
     _, out, _ = run(folder, *sound_readings(folder))
     assert "All 6 readings are recorded." in out
     assert f"  orthocal validate CALIBRATION {folder}\n" in out
-    assert out.rstrip().endswith(f"or identify new ones:\n  orthocal calibrate {folder}")
+    assert out.rstrip().endswith(f"sessions together:\n  orthocal calibrate EARLIER {folder}")
 
 
 def test_instructions_of_a_setup_and_a_posture(folder, run):

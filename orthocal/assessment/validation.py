@@ -20,6 +20,7 @@ from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import expanded_uncertainty, find_entries
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
+from orthocal.assessment.plausibility import find_scattered
 from orthocal.assessment.predictive import (
     DeviationTest,
     Repetition,
@@ -225,18 +226,17 @@ def validate_calibration(
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
     fit, refit = _refit(calibration, join_sessions(measured))
-    all_sessions = join_sessions([restore_session(calibration), *measured])
+    before = restore_session(calibration)
+    all_sessions = join_sessions([before, *measured])
     anomalies = find_anomalies(all_sessions)
     judgement = judge_session(all_sessions, anomalies=anomalies)
     mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
-    explained = _are_in_new_rows(anomalies, all_sessions, fit.problem.session)
+    explained = _explain_deviations(anomalies, before, fit.problem.session)
     agreement = _describe_agreement(refit, test, expected_rms, judgement, explained=explained)
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
-    joint, findings = None, judgement.findings
-    if confirmed:
-        joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
-        confirmed = joint is not None
+    joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
+    confirmed = confirmed and joint is not None
     entries, notes = _choose_entries(calibration, joint, all_sessions, mistake)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
@@ -326,17 +326,27 @@ def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) ->
     return True if judgement.verdict == "enter" else None
 
 
-def _are_in_new_rows(anomalies: Anomalies, all_sessions: Session, new: Session) -> bool:
-    """True if there are anomalies, and each of them is one of new rows, which are the last."""
-    first = len(all_sessions.readings) - len(new.readings)
+def _explain_deviations(anomalies: Anomalies, before: Session, new: Session) -> bool:
+    """True if wrong new readings explain deviations.
+
+    Each anomaly is then one of new rows, which follow those of the calibration. Without anomalies,
+    only new readings do not repeat.
+    """
+    if not anomalies.found:
+        return bool(find_scattered(new)) and not find_scattered(before)
     found = [e for a in anomalies.found for e in (a.explanation, *a.causes, *a.alternatives)]
-    return bool(found) and all(e.rows and min(e.rows) >= first for e in found)
+    return all(e.rows and min(e.rows) >= len(before.readings) for e in found)
 
 
 def _calibrate_jointly(
-    calibration: Calibration, all_sessions: Session, judgement: Judgement
+    calibration: Calibration, all_sessions: Session, judgement: Judgement, confirmed: bool | None
 ) -> tuple[Calibration | None, tuple[Finding, ...]]:
-    """Assessed calibration from all sessions, or None if an offset is held by a bound; findings."""
+    """Assessed calibration from all sessions, and the findings about them.
+
+    The calibration is None if the earlier one is not confirmed, or if an offset is held by a bound.
+    """
+    if not confirmed:
+        return None, judgement.findings
     fit = repeat_fit(calibration, all_sessions, tolerance_scale=judgement.tolerance_scale)
     joint = assemble_calibration(fit)
     assessment = assess(joint, all_sessions, judgement=judgement)
@@ -525,10 +535,14 @@ def _decide(
     against = [f for f in findings if f.severity != "note"]
     reasons = [f for f in (agreement, *against) if f.severity != "note"]
     headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
+    action = describe_actions(against) or agreement.action
+    if confirmed is None and against:
+        separator = "\n" if "\n" in action else " "
+        action = f"{action}{separator}Then validate again.".lstrip()
     return ValidationDecision(
         verdict_of(against),
         headlines[confirmed],
         join_texts([f.text for f in reasons or [agreement]]),
-        describe_actions(against) or agreement.action,
+        action,
         confirmed,
     )

@@ -22,9 +22,11 @@ from orthocal import (
     check_session,
     draw_errors,
     join_sessions,
+    load_session,
     simulate_session,
     summarize,
     validate_calibration,
+    write_session,
 )
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import (
@@ -466,6 +468,32 @@ def test_a_wrong_new_reading_makes_a_validation_inconclusive(plan):
     assert larger.text not in summarize(result)
     assert result.assessment.decision.exit_code == 3
     assert_nothing_new_to_enter(result)
+
+
+def test_new_readings_that_do_not_repeat_make_a_validation_inconclusive(plan):
+    errors, _, calibration = calibrated_machine("raw-cycles", "full", 3)
+    entered = plan.with_controller(entered_offsets(calibration))
+    session = simulate_session(entered, errors, seed=4, sigma=40e-6).session
+    result = validate_calibration(calibration, session)
+    assert result.assessment.of_kind("scattered repeats")
+    assert result.confirmed is None
+    assert result.as_expected is False
+    assert result.assessment.decision.action.endswith("Then validate again.")
+
+
+def test_a_wrong_reading_is_not_read_again_after_other_offsets_were_entered(plan, tmp_path):
+    first = simulate_session(plan, TRUTH, seed=1).session
+    values = first.values + 0.3e-3 * (np.arange(len(first.values)) == 4)
+    write_session(first.with_values(values), tmp_path / "first")
+    read = load_session(tmp_path / "first")
+    line = read.readings[4].line
+    entered = plan.with_controller(np.array([0.5e-3, -0.2e-3, 0.1e-3]))
+    for offsets, again in ((plan, True), (entered, False)):
+        second = simulate_session(offsets, TRUTH, seed=2).session
+        action = check_session(join_sessions([read, second])).decision.action
+        assert (f"type `again {line}`" in action) == again
+        assert ("Do not read it again" in action) != again
+        assert f"`drop {line}` deletes it" in action
 
 
 def test_an_inconclusive_validation_states_reason_and_next_step_only(plan):

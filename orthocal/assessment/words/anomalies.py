@@ -23,7 +23,7 @@ from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
-from orthocal.session.session import Session, split_label
+from orthocal.session.session import Reading, Session, split_label
 from orthocal.text import capitalised, printable, spans, uncapitalised
 from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM, Unit
 
@@ -696,6 +696,12 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
         return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
     others = "" if len(rows) == 1 else ", likewise the other lines"
+    correct = f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
+    if any(_offsets_of(session, r) != _offsets_of(session, session.readings[-1]) for r in rows):
+        return (
+            f"Do not read {what} again, because other offsets are active now. Compare with your "
+            f"notes: in `orthocal record {path}` {correct}"
+        )
     moved = ""
     if any(r.setup != session.readings[-1].setup for r in rows):
         moved = (
@@ -703,8 +709,15 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
         )
     return (
         f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}.{moved} "
-        f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
+        f"{correct}"
     )
+
+
+def _offsets_of(session: Session, reading: Reading) -> list[float]:
+    """Offsets that the controller had during a reading, [m, rad]."""
+    active = session.setups[reading.setup].active
+    offsets: list[float] = (session.active_offsets if active is None else active).tolist()
+    return offsets
 
 
 def _choose_factor(explanations: Sequence[Explanation]) -> str:

@@ -12,9 +12,9 @@ CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
 INCONCLUSIVE = "The validation is inconclusive."
 
-RECALIBRATE = "Calibrate from this session and enter its offsets."
+RECALIBRATE = "calibrate from this session and enter its offsets."
 
-RECALIBRATE_PRINTER = "Calibrate from this log and export its settings."
+RECALIBRATE_PRINTER = "calibrate from this log and export its settings."
 
 CALIBRATE_JOINTLY = "Calibrate the sessions together and enter these offsets."
 
@@ -59,13 +59,17 @@ def larger_than_predicted(
     if refit is not None:
         if explains:
             where = "other settings were active" if firmware else "a gauge was mounted elsewhere"
-            cause = f"the machine has changed, or {where} than stated"
-            action = RECALIBRATE_PRINTER if firmware else RECALIBRATE
+            cause = f"a reading is wrong, {where} than stated, or the machine has changed"
+            repeat = (
+                "Probe again" if firmware else f"Repeat setup {place.setup}, which deviates most"
+            )
+            action = f"{repeat}, and validate again. If nothing changes, "
+            action += RECALIBRATE_PRINTER if firmware else RECALIBRATE
         else:
             cause = "the readings scatter more than before, or something moved during the session"
             action = f"Check the mounting of the {'probe' if firmware else 'gauge'}, then "
             action += "probe again." if firmware else "read again."
-        text += f" After a new fit {mm(refit)} mm RMS remain. Probably {cause}."
+        text += f" After a new fit {mm(refit)} mm RMS remain. Possible: {cause}."
     return review("larger than predicted", text, action, (place,), **numbers)
 
 

@@ -438,7 +438,7 @@ class RecordingText:
             following = (
                 "Next: validate the offsets that were entered, by their calibration,\n"
                 f"  orthocal validate CALIBRATION {command}\n"
-                f"or identify new ones:\n  orthocal calibrate {command}"
+                f"or calibrate all sessions together:\n  orthocal calibrate EARLIER {command}"
             )
         return "\n".join([*(self.wrap(line) for line in lines), following])
 
