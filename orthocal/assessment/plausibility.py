@@ -344,8 +344,9 @@ def _check_repeats(session: Session, name: str) -> Finding | None:
 
 
 def _if_several(session: Session, gauge: str) -> str:
-    """Name of a gauge, empty if the session has no other."""
-    return gauge if len(session.gauges) > 1 else ""
+    """Name of a gauge, empty if the readings of the session have no other."""
+    used = {session.setups[r.setup].gauge for r in session.readings}
+    return gauge if len(used) > 1 else ""
 
 
 def _lengths(robot: Robot) -> dict[str, float]:

@@ -475,7 +475,8 @@ def test_new_readings_that_do_not_repeat_make_a_validation_inconclusive(plan):
     entered = plan.with_controller(entered_offsets(calibration))
     session = simulate_session(entered, errors, seed=4, sigma=40e-6).session
     result = validate_calibration(calibration, session)
-    assert result.assessment.of_kind("scattered repeats")
+    (scatter,) = result.assessment.of_kind("scattered repeats")
+    assert "the gauge alone by" in scatter.text
     assert result.confirmed is None
     assert result.as_expected is False
     assert result.assessment.decision.action.endswith("Then validate again.")
