@@ -226,6 +226,12 @@ ENTRIES = {
     "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Line 4: yx x_min (4 of 5 missing)"),
     "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Line 4: yx x_min (4 of 5 missing)"),
     "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
+    "restart of an earlier setup": (
+        ["0.1", "0.2", "0.3", "0.4", "restart 3", "0.5"],
+        ["0.50", "", "", "0.40"],
+        "Deleted: all readings of yx Setup yx, 1 of 2",
+    ),
+    "restart of nothing": (["restart 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
     "list": (["0.1", "list"], ["0.10"], "3 yx x_max: not read"),
     "show": (["show"], [], "Setup yx, 1 of 2"),
     "help": (["help"], [], "again: read the last line once more, as another cycle"),
@@ -413,16 +419,16 @@ REPEATED = ("zero", "x_max", "zero", "x_max", "zero")
     ("gauge", "values", "kinds"),
     [
         ("sigma_mm: 0.005, resolution_mm: 0.01", (0.1, 0.5, 0.12), []),
-        ("sigma_mm: 0.005, resolution_mm: 0.01", (0.1, 0.5, 0.16), ["scattered repeats"]),
+        ("sigma_mm: 0.005, resolution_mm: 0.01", (0.1, 0.5, 0.16), ["differing closing reading"]),
         ("sigma_mm: 0.005, resolution_mm: 0.01", (0.1, 0.5, 0.1, 0.45), ["scattered repeats"]),
         ("sigma_mm: 0.005, resolution_mm: 0.01", (0.1, 0.5, 0.1, 0.51, 0.11), []),
         ("sigma_mm: 0.02", (0.1, 0.5, 0.16), []),
-        ("sigma_mm: 0.02", (0.1, 0.5, 0.26), ["scattered repeats"]),
+        ("sigma_mm: 0.02", (0.1, 0.5, 0.26), ["differing closing reading"]),
         ("sigma_mm: 0.005, resolution_mm: 0.01", (0.1, 0.505), ["finer than the gauge"]),
         ("range_mm: [-5, 5]", (0.1, 0.5, 4.0), ["ambiguous"]),
     ],
 )
-def test_scattered_repeats_warn_before_the_setup_is_complete(folder, run, gauge, values, kinds):
+def test_repeats_that_differ_warn_before_the_setup_is_complete(folder, run, gauge, values, kinds):
     plan = PLAN.replace("sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5]", gauge)
     (folder / "session.yaml").write_text(plan + "readings: readings.csv\n")
     rows = [f"yx,{p},{1 + k // 2}," for k, p in enumerate(REPEATED)]

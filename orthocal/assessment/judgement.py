@@ -19,8 +19,8 @@ from orthocal.assessment.plausibility import (
     find_finer,
     find_implausible,
     find_impossible_gauges,
-    find_scattered,
 )
+from orthocal.assessment.repeated_readings import find_differing_closings, find_scattered
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import (
     describe_anomalies,
@@ -120,12 +120,18 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
             scale_findings = [_describe_beyond(session, scale.factor)]
         elif scale.factor > 1.0:
             scale_findings = [words.above_tolerances(scale.factor)]
+    closings = [] if mistakes else find_differing_closings(session)
     sound = verdict_of([*mistakes, *implausible, *scale_findings]) == "enter"
     no_change = [_describe_detectable(session)] if session.joined and sound else []
     order = _describe_order(session) if session.joined else []
     unshown_effects = find_unshown_effects(session)
     return Judgement(
-        rank([*implausible, *mistakes, *order, *no_change, *scale_findings, *unshown_effects]),
+        rank(
+            [
+                *(*implausible, *mistakes, *closings, *order),
+                *(*no_change, *scale_findings, *unshown_effects),
+            ]
+        ),
         scale,
     )
 
@@ -170,7 +176,7 @@ def is_far(value: float, mean: float, std: float) -> bool:
 
 
 def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list[Finding]:
-    """Findings about anomalies; if there are none, about scattered repeats.
+    """Findings about anomalies; if there are none, about readings that do not repeat.
 
     If a gauge is impossible as stated, the findings are about gauges alone.
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arrays import Array
-from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, Place
@@ -17,15 +16,11 @@ from orthocal.errors import OrthocalError
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.hypotheses.families.unit_and_sign import decimal_step
-from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
-from orthocal.measurement.motion.approach import label_reading
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
-from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import INCH, MM
 
@@ -67,7 +62,7 @@ SAME_LENGTH = 5.0
 """Largest difference of lengths of equal legs, in prior standard deviations of a translation."""
 
 MISTAKE_PROBABILITY = 1e-6
-"""Probability by chance below which differences of repeated readings, or steps, are a mistake."""
+"""Probability by chance below which readings on steps of an inch are a mistake."""
 
 
 def find_implausible(session: Session, *, explained: bool = False) -> tuple[Finding, ...]:
@@ -87,15 +82,6 @@ def find_implausible(session: Session, *, explained: bool = False) -> tuple[Find
         findings += [_check_distances(part), *(() if explained else find_finer(part))]
         if problem is not None and part.readings:
             findings += _by_model(part, problem, fit=not explained)
-    return tuple(f for f in findings if f is not None)
-
-
-def find_scattered(session: Session) -> tuple[Finding, ...]:
-    """Findings about gauges whose repeated readings differ by far more than their noise.
-
-    If many readings are wrong, no single mistake is evident, but the readings do not repeat.
-    """
-    findings = (_check_repeats(part, g) for part in split_sessions(session) for g in part.gauges)
     return tuple(f for f in findings if f is not None)
 
 
@@ -134,7 +120,12 @@ def find_finer(session: Session) -> Iterator[Finding]:
             inches = _fit_inches(session.values[rows], step)
             first = _first(session, finer)
             yield words.finer_than_gauge(
-                len(finer), len(rows), step, *first, inches=inches, name=_if_several(session, name)
+                len(finer),
+                len(rows),
+                step,
+                *first,
+                inches=inches,
+                name=name_if_several(session, name),
             )
 
 
@@ -306,44 +297,7 @@ def _legs(robot: Robot) -> Finding | None:
     return words.legs_differ(describe_legs(robot), lengths)
 
 
-def _check_repeats(session: Session, name: str) -> Finding | None:
-    """Finding about repeated readings of a gauge that differ by far more than its noise."""
-    gauge = session.gauges[name]
-    if gauge.sigma is None:
-        return None
-    sigma = stated_sigma(gauge)
-    repeated = [
-        rows
-        for (setup, *_), rows in Rows(session).repeated.items()
-        if len(rows) > 1 and session.setups[setup].gauge == name
-    ]
-    if not repeated:
-        return None
-    values = session.values
-
-    def sum_of_squares(rows: NDArray[np.int64]) -> float:
-        n_entries = 1.0 + session.is_difference(session.readings[rows[0]])
-        return float(((values[rows] - values[rows].mean()) ** 2).sum()) / n_entries
-
-    total, dof = sum(map(sum_of_squares, repeated)), sum(len(rows) - 1 for rows in repeated)
-    if chance_of_excess(total / sigma**2, dof) > MISTAKE_PROBABILITY:
-        return None
-    worst = max(repeated, key=sum_of_squares)
-    shown = ", ".join(
-        f"{signed(values[i] / MM)} mm" + (f" in line {line}" if line is not None else "")
-        for i, line in ((i, session.readings[i].line) for i in worst[:4])
-    )
-    return words.scattered_repeats(
-        math.sqrt(total / dof),
-        sigma,
-        label_reading(session.robot, session.readings[worst[0]]),
-        shown,
-        [place_of(session, i) for i in worst[:MAX_PLACES]],
-        _if_several(session, name),
-    )
-
-
-def _if_several(session: Session, gauge: str) -> str:
+def name_if_several(session: Session, gauge: str) -> str:
     """Name of a gauge, empty if the readings of the session have no other."""
     used = {session.setups[r.setup].gauge for r in session.readings}
     return gauge if len(used) > 1 else ""

@@ -20,7 +20,6 @@ from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import expanded_uncertainty, find_entries
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
-from orthocal.assessment.plausibility import find_scattered
 from orthocal.assessment.predictive import (
     DeviationTest,
     Repetition,
@@ -28,6 +27,7 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
+from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.assessment.wording import describe_actions, join_texts
 from orthocal.assessment.words import validation as words
 from orthocal.calibration.adjusting import adjust_calibration

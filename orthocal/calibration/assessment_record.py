@@ -49,6 +49,7 @@ FindingKind = Literal[
     "change unknown",
     "wrong order",
     "scattered repeats",
+    "differing closing reading",
     "readings missing",
     "no anomaly",
     # implausible readings and settings

@@ -432,7 +432,10 @@ class Dialogue:
             which = f" ({' or '.join(names)}?)" if names else ""
             raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
         name = names[0]
-        row_commands = {"back": self._back, "again": self._again, "drop": self._drop}
+        row_commands = {
+            **{"back": self._back, "again": self._again},
+            **{"drop": self._drop, "restart": self._restart},
+        }
         if name in ("temperature", "side") and len(arguments) == 1:
             self._set_condition(name, arguments[0])
             return
@@ -453,7 +456,7 @@ class Dialogue:
             self._conditions.clock = not self._conditions.clock
             self._note(self._text.clock(on=self._conditions.clock))
         else:
-            {"skip": self._skip, "restart": self._restart, "show": self._show_again}[name]()
+            {"skip": self._skip, "show": self._show_again}[name]()
 
     def _parse_row(self, text: str) -> int:
         """Index of a row from its line."""
@@ -491,7 +494,7 @@ class Dialogue:
         if self._last is not None and self._recording.rows[self._last].setup != setup:
             self._note(
                 f"The stand has been moved since {setup} was read: {advice}. To read there again, "
-                "`restart` the setup."
+                f"type `restart {self._recording.rows[index].line}`."
             )
 
     def _again(self, index: int | None) -> None:
@@ -531,10 +534,11 @@ class Dialogue:
         self._judge()
         self._ask_for_next()
 
-    def _restart(self) -> None:
-        index = self._last if self._asked is None else self._asked
+    def _restart(self, index: int | None) -> None:
         if index is None:
-            raise SessionError("nothing was read yet")
+            index = self._last if self._asked is None else self._asked
+        if index is None:
+            raise SessionError("no line is asked for; `restart 7` repeats the setup of line 7")
         recording = self._recording
         setup = self._text.name(recording.rows[index])
         recording.empty(index)

@@ -153,7 +153,8 @@ class LinearModel:
     @property
     def active(self) -> Array:
         """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
-        return self._of_sessions(_active_by_setup(self.problem.session))
+        session = self.problem.session
+        return self._of_sessions([session.active_during(name) for name in session.setups])
 
     @property
     def compensated(self) -> Array:
@@ -687,16 +688,10 @@ def _refer_to_most_corrected(session: Session) -> Session:
     if not session.joined:
         return session
     largest = max(
-        _active_by_setup(session),
+        [session.active_during(name) for name in session.setups],
         key=lambda offsets: (float(np.abs(offsets).max()), *offsets.tolist()),
     )
     return replace(session, controller_offsets=largest)
-
-
-def _active_by_setup(session: Session) -> list[Array]:
-    """Active offsets of each setup, shape (n_drives,) each, [m, rad]."""
-    setups = session.setups.values()
-    return [session.active_offsets if s.active is None else s.active for s in setups]
 
 
 def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], Indices]:

@@ -33,6 +33,10 @@ from orthocal.units import MM
 DISTANCE_DECIMALS = 9
 """Decimals in m and rad to which distances from the mechanical zero are compared."""
 
+USUAL_STEPS, USUAL_STDS = 2.0, 4.0
+"""Largest usual difference of two readings: in steps of the dial, or in standard deviations of a
+reading if that is more."""
+
 
 PostureForm = Literal["tcp", "joints"]
 """Kind of the commanded coordinates: of the tool centre point or of the drives."""
@@ -63,6 +67,11 @@ class Gauge:
     sigma: float | None = None
     resolution: float | None = None
     range: tuple[float, float] | None = None
+
+    @property
+    def usual_difference(self) -> float:
+        """Largest usual difference of two readings of one posture, [m]; 0 if unknown."""
+        return max(USUAL_STEPS * (self.resolution or 0.0), USUAL_STDS * (self.sigma or 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,9 +319,13 @@ class Session:
 
         Shape (n_setups, n_drives), [m, rad].
         """
-        stated = [s.active for s in self.setups.values()]
-        active = [self.active_offsets if a is None else a for a in stated]
+        active = [self.active_during(name) for name in self.setups]
         return np.asarray(self.robot.drive_zero - np.array(active))
+
+    def active_during(self, setup: str) -> Array:
+        """Active offsets during the readings of a setup, shape (n_drives,), [m, rad]."""
+        stated = self.setups[setup].active
+        return self.active_offsets if stated is None else stated
 
     @property
     def alignment_postures(self) -> dict[str, str]:

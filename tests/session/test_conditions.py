@@ -22,7 +22,7 @@ from orthocal import (
     write_import,
     write_session,
 )
-from orthocal.assessment.plausibility import find_scattered
+from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.calibration.identify import identify
 from orthocal.errors import CalibrationFileError, SessionError
 from orthocal.measurement.importing.import_readings import TableOptions

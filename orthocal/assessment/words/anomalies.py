@@ -7,6 +7,8 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from orthocal.assessment.wording import (
     joined,
     mm,
@@ -224,7 +226,7 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     changes = joined([f"{plain(size)} {unit}" for unit, size in sizes.items()], "or")
     text = (
         f"No change between the sessions was found. One offset that changed by {changes} between "
-        "them would have been detected."
+        "them would have been detected. `orthocal validate` detects smaller deviations."
     )
     if undetectable:
         text += f" A change of {joined(tuple(undetectable), 'or')} would not have been."
@@ -669,13 +671,19 @@ def _remedy(session: Session, e: Explanation) -> str:
         "then read it again, or leave it out.",
         "swapped rows": "If so, swap them back.",
         "stuck dial": "Check that the plunger moves freely and touches, and read these again.",
-        "displaced gauge": f"If so, read setup {''.join(e.names[:1])} again, or make a new setup "
-        "of the later readings.",
+        "displaced gauge": _repeat_setup(session, e),
         "drift": "Wait until machine and gauge have the same temperature, and return to the first "
         "posture at the end of the setup. Or calibrate with `--effects "
         f"{','.join((*session.robot.effect_names, 'drift'))}`.",
     }
     return remedies.get(e.kind) or _repeat(session, e)
+
+
+def _repeat_setup(session: Session, e: Explanation) -> str:
+    """Action after a displaced gauge."""
+    restart = describe_restart(session, session.readings[e.rows[0]])
+    divide = "make a new setup of the later readings."
+    return f"If so, {restart}. Or {divide}" if restart else f"If so, {divide}"
 
 
 def _repeat(session: Session, *explanations: Explanation) -> str:
@@ -697,7 +705,7 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
     others = "" if len(rows) == 1 else ", likewise the other lines"
     correct = f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
-    if any(_offsets_of(session, r) != _offsets_of(session, session.readings[-1]) for r in rows):
+    if not all(_has_present_offsets(session, r) for r in rows):
         return (
             f"Do not read {what} again, because other offsets are active now. Compare with your "
             f"notes: in `orthocal record {path}` {correct}"
@@ -705,7 +713,7 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     moved = ""
     if any(r.setup != session.readings[-1].setup for r in rows):
         moved = (
-            " If the gauge has been moved since, type `restart` there: it reads the setup again."
+            f" If the gauge has been moved since, type `restart {line}`: it reads the setup again."
         )
     return (
         f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}.{moved} "
@@ -713,11 +721,22 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     )
 
 
-def _offsets_of(session: Session, reading: Reading) -> list[float]:
-    """Offsets that the controller had during a reading, [m, rad]."""
-    active = session.setups[reading.setup].active
-    offsets: list[float] = (session.active_offsets if active is None else active).tolist()
-    return offsets
+def _has_present_offsets(session: Session, reading: Reading) -> bool:
+    """True if the controller had the offsets of the last reading, so that it can be read again."""
+    present = session.active_during(session.readings[-1].setup)
+    return bool(np.array_equal(session.active_during(reading.setup), present))
+
+
+def describe_restart(session: Session, reading: Reading) -> str:
+    """Clause with the command that reads the setup of a reading again.
+
+    Empty if other offsets are active now, or if the reading is not in a file.
+    """
+    file = reading.file or session.readings_path
+    if file is None or reading.line is None or not _has_present_offsets(session, reading):
+        return ""
+    path = printable(shlex.quote(str(file.parent)))
+    return f"read the setup again: in `orthocal record {path}` type `restart {reading.line}`"
 
 
 def _choose_factor(explanations: Sequence[Explanation]) -> str:

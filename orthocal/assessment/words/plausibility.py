@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import note, parameter_places, reject, review, times
-from orthocal.calibration.assessment_record import Finding, Place
+from orthocal.assessment.wording import (
+    joined,
+    note,
+    parameter_places,
+    reject,
+    review,
+    signed,
+    times,
+)
+from orthocal.calibration.assessment_record import Finding, Place, Severity
 from orthocal.robot.parameters import Parameter
 from orthocal.text import spans
 from orthocal.units import MM, UM, show_limit
@@ -257,4 +265,39 @@ def scattered_repeats(
         places,
         scatter_mm=scatter / MM,
         gauge_mm=gauge / MM,
+    )
+
+
+def differing_closings(
+    setups: Sequence[tuple[str, float, Sequence[int | None]]],
+    usual: float,
+    restart: str,
+    places: Sequence[Place],
+    *,
+    severity: Severity,
+) -> Finding:
+    """Finding about closing readings that differ from the first readings of their setups.
+
+    Args:
+        setups: Name of each setup, its closing reading minus its first one, [m], and their lines.
+        usual: Largest usual difference, [m].
+        restart: How to read the first of these setups again; empty if that is not possible.
+        places: Places of the closing readings.
+        severity: Severity of the finding.
+    """
+    described = []
+    for name, difference, lines in setups:
+        known = [line for line in lines if line is not None]
+        where = f", {spans(known, 'line')}" if known else ""
+        described.append(f"{name} ({signed(difference / MM)} mm{where})")
+    noun = "setup" if len(setups) == 1 else "setups"
+    return Finding(
+        "differing closing reading",
+        severity,
+        f"The closing reading differs from the first one by more than {usual / MM:.2g} mm in "
+        f"{noun} {joined(described)}. The gauge or the machine was displaced, or a reading is "
+        "wrong.",
+        f"Check both readings. If they are right, {restart or 'omit the setup'}.",
+        {"largest_difference_mm": max(abs(d) for _, d, _ in setups) / MM},
+        tuple(places),
     )

@@ -55,10 +55,6 @@ FROM_ANOTHER_SIDE = (
 )
 """The same where the closing reading has another approach than the first."""
 
-MAX_STEPS, MAX_STDS = 2.0, 4.0
-"""Largest usual difference of two readings: in steps of the dial, or in standard deviations of a
-reading if that is more."""
-
 END_OF_POINTS = (
     "Compare the points of the first posture with each other. If they differ by more than the "
     "instrument scatters, repeat this setup: the instrument or the machine was displaced. "
@@ -256,8 +252,7 @@ def _compare_closing(session: Session, motion: SetupMotion) -> str:
         return ""
     if last.repeats is None or last.approach != first.approach:
         return FROM_ANOTHER_SIDE
-    gauge = session.gauges[setup.gauge]
-    largest = max(MAX_STEPS * (gauge.resolution or 0.0), MAX_STDS * (gauge.sigma or 0.0))
+    largest = session.gauges[setup.gauge].usual_difference
     reading = "0" if first.role == "subtracted" else f"that of line {last.repeats}"
     return END.format(reading, f"{_short(largest)} mm" if largest else "two steps of the dial")
 

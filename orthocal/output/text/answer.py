@@ -52,6 +52,7 @@ MOST_LISTED = 4
 """Further findings that the short answer lists."""
 
 LISTED: tuple[FindingKind, ...] = (
+    "differing closing reading",
     "wrong order",
     "no change",
     "change unknown",

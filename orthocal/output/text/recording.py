@@ -45,7 +45,8 @@ COMMANDS = {
     "again": "read the last line once more, as another cycle; `again 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
-    "restart": "delete the readings of this setup and read it again, if the gauge has moved",
+    "restart": "delete the readings of this setup and read it again, if the gauge has moved; "
+    "`restart 7` the setup of line 7",
     "temperature": "temperature of the following readings in °C, such as `t 22.5`",
     "side": "side of approach of the following readings where the plan states none: `side n`",
     "clock": "begin or stop to note the time of each reading; stop if you type from paper",

@@ -1,0 +1,104 @@
+"""Closing readings that differ from the first readings of their setups."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from models import TRUTH
+from planned import quick_plan
+
+from orthocal import (
+    calibrate,
+    check_session,
+    join_sessions,
+    load_session,
+    simulate_session,
+    write_session,
+)
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.repeated_readings import find_differing_closings, find_scattered
+from orthocal.hypotheses.hypothesis import Rows
+
+KIND = "differing closing reading"
+
+
+@pytest.fixture(scope="module")
+def sound():
+    """Planned readings with a closing reading in each setup, exactly repeated."""
+    session = simulate_session(quick_plan().session, TRUTH, seed=3).session
+    values = session.values
+    for rows in Rows(session).setups.values():
+        values[rows[-1]] = values[rows[0]]
+    return session.with_values(values)
+
+
+def with_closings(session, *differences):
+    """Session whose first setups have closing readings that differ by these amounts, [m]."""
+    values = session.values
+    for rows, difference in zip(Rows(session).setups.values(), differences, strict=False):
+        values[rows[-1]] = values[rows[0]] + difference
+    return session.with_values(values)
+
+
+@pytest.mark.parametrize(
+    ("differences", "severities"),
+    [
+        ((0.02e-3,), []),  # the sheet allows two steps of the dial
+        ((-0.03e-3,), ["note"]),
+        ((0.045e-3,), ["review"]),
+        ((0.045e-3, -0.045e-3), ["review"]),
+        ((0.03e-3, 0.045e-3), ["review"]),
+    ],
+)
+def test_check_and_calibrate_name_closing_readings_that_differ(sound, differences, severities):
+    session = with_closings(sound, *differences)
+    (gauge,) = session.gauges.values()
+    assert gauge.usual_difference == pytest.approx(4.0 * gauge.sigma)
+    for assessment in (check_session(session), assessment_of(calibrate(session))):
+        findings = assessment.of_kind(KIND)
+        assert [f.severity for f in findings] == severities
+        assert assessment.decision.verdict == ("review" if severities == ["review"] else "enter")
+        for finding in findings:
+            size = finding.numbers["largest_difference_mm"]
+            assert size == pytest.approx(max(map(abs, differences)) * 1e3)
+            assert {p.setup for p in finding.places} <= set(list(session.setups)[:2])
+
+
+def test_readings_of_which_most_closings_differ_scatter(sound):
+    session = with_closings(sound, *(60e-6 * (-1) ** i for i in range(len(sound.setups))))
+    (finding,) = find_scattered(session)
+    assert finding.kind == "scattered repeats"
+
+
+def test_two_readings_in_succession_have_no_closing_reading(sound):
+    session = with_closings(sound, 0.06e-3)
+    assert find_scattered(session)
+    setup = session.readings[0].setup
+    repeated = [i for i, r in enumerate(session.readings) if r.setup == setup]
+    session = session.select([r for i, r in enumerate(session.readings) if i not in repeated[1:-1]])
+    (finding,) = find_scattered(session)  # read twice in succession: nothing moved in between
+    assert finding.kind == "scattered repeats"
+
+
+def test_sound_sessions_have_no_finding_and_few_notes():
+    plan, notes, setups = quick_plan().session, 0, 0
+    for seed in range(200):
+        session = simulate_session(plan, TRUTH, seed=seed).session
+        assert not find_scattered(session)
+        notes += sum(len(f.places) for f in find_differing_closings(session))
+        setups += len(session.setups)
+    # 4 sigma of a reading are 2.83 standard deviations of a difference: 0.5 % of normal ones
+    assert notes / setups < 0.02
+
+
+def test_the_setup_is_read_again_unless_other_offsets_are_active(sound, tmp_path):
+    write_session(with_closings(sound, 0.045e-3), tmp_path / "first")
+    first = load_session(tmp_path / "first")
+    line = first.readings[Rows(first).setups[first.readings[0].setup][-1]].line
+    entered = simulate_session(
+        quick_plan().session.with_controller(np.array([0.5e-3, -0.2e-3, 0.1e-3])), TRUTH, seed=4
+    ).session
+    for session, again in ((first, True), (join_sessions([first, entered]), False)):
+        (finding,) = check_session(session).of_kind(KIND)
+        assert (f"type `restart {line}`" in finding.action) == again
+        assert ("omit the setup" in finding.action) != again
