@@ -12,7 +12,7 @@ from orthocal.arrays import Indices
 from orthocal.assessment.plausibility import name_if_several
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
-from orthocal.assessment.words.anomalies import MAX_PLACES, describe_restart, place_of
+from orthocal.assessment.words.anomalies import MAX_PLACES, command_to_restart, place_of
 from orthocal.calibration.assessment_record import Finding, Severity
 from orthocal.estimation.weighting import stated_sigma
 from orthocal.hypotheses.hypothesis import Rows
@@ -171,7 +171,7 @@ def _describe_closings(
     return words.differing_closings(
         setups,
         part.gauges[gauge].usual_difference,
-        describe_restart(session, part.readings[last[0]]),
+        command_to_restart(session, part.readings[last[0]]),
         [place_of(part, i) for i in last],
         severity=severity,
     )

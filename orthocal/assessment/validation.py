@@ -30,6 +30,7 @@ from orthocal.assessment.predictive import (
 from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.assessment.wording import describe_actions, join_texts
 from orthocal.assessment.words import validation as words
+from orthocal.assessment.words.anomalies import command_to_restart, place_of
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
     EXIT_CODES,
@@ -38,7 +39,6 @@ from orthocal.calibration.assessment_record import (
     Decision,
     Finding,
     FindingKind,
-    Place,
 )
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
@@ -233,7 +233,7 @@ def validate_calibration(
     mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     explained = _explain_deviations(anomalies, before, fit.problem.session)
-    agreement = _describe_agreement(refit, test, expected_rms, judgement, explained=explained)
+    agreement = _describe_agreement(refit, fit, test, expected_rms, judgement, explained=explained)
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
@@ -434,6 +434,7 @@ def _is_wrongly_entered(all_sessions: Session, mistake: Anomaly | None) -> bool:
 
 def _describe_agreement(
     refit: Calibration,
+    fit: Fit,
     test: DeviationTest,
     expected: float,
     judgement: Judgement,
@@ -443,7 +444,8 @@ def _describe_agreement(
     """Finding about the agreement of the deviations with their prediction.
 
     Args:
-        refit: Fit of the new readings, assessed.
+        refit: Calibration of the new readings, assessed.
+        fit: Its fit.
         test: Test of the deviations.
         expected: Predicted RMS of the deviations, [m].
         judgement: Judgement of all sessions.
@@ -463,7 +465,8 @@ def _describe_agreement(
     if as_expected is None:
         return words.nothing_predicted(numbers)
     if not as_expected:
-        worst = max(refit.residuals, key=lambda r: abs(r.deviation))
+        largest = int(np.argmax([abs(r.deviation) for r in refit.residuals]))
+        session = fit.problem.session
         finding = words.larger_than_predicted(
             achieved,
             limit,
@@ -471,7 +474,8 @@ def _describe_agreement(
             explains=refit.rms_after < EXPLAINED_RATIO * achieved,
             firmware=refit.session.firmware is not None,
             numbers=numbers,
-            place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
+            place=place_of(session, largest),
+            command=command_to_restart(session, session.readings[largest]),
         )
         return replace(finding, severity="note") if explained else finding
     return words.as_predicted(achieved, limit, numbers)

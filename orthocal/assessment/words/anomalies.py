@@ -681,9 +681,9 @@ def _remedy(session: Session, e: Explanation) -> str:
 
 def _repeat_setup(session: Session, e: Explanation) -> str:
     """Action after a displaced gauge."""
-    restart = describe_restart(session, session.readings[e.rows[0]])
+    command = command_to_restart(session, session.readings[e.rows[0]])
     divide = "make a new setup of the later readings."
-    return f"If so, {restart}. Or {divide}" if restart else f"If so, {divide}"
+    return f"If so, read the setup again: {command}. Or {divide}" if command else f"If so, {divide}"
 
 
 def _repeat(session: Session, *explanations: Explanation) -> str:
@@ -727,7 +727,7 @@ def _has_present_offsets(session: Session, reading: Reading) -> bool:
     return bool(np.array_equal(session.active_during(reading.setup), present))
 
 
-def describe_restart(session: Session, reading: Reading) -> str:
+def command_to_restart(session: Session, reading: Reading) -> str:
     """Clause with the command that reads the setup of a reading again.
 
     Empty if other offsets are active now, or if the reading is not in a file.
@@ -736,7 +736,7 @@ def describe_restart(session: Session, reading: Reading) -> str:
     if file is None or reading.line is None or not _has_present_offsets(session, reading):
         return ""
     path = printable(shlex.quote(str(file.parent)))
-    return f"read the setup again: in `orthocal record {path}` type `restart {reading.line}`"
+    return f"in `orthocal record {path}` type `restart {reading.line}`"
 
 
 def _choose_factor(explanations: Sequence[Explanation]) -> str:

@@ -271,7 +271,7 @@ def scattered_repeats(
 def differing_closings(
     setups: Sequence[tuple[str, float, Sequence[int | None]]],
     usual: float,
-    restart: str,
+    command: str,
     places: Sequence[Place],
     *,
     severity: Severity,
@@ -281,7 +281,7 @@ def differing_closings(
     Args:
         setups: Name of each setup, its closing reading minus its first one, [m], and their lines.
         usual: Largest usual difference, [m].
-        restart: How to read the first of these setups again; empty if that is not possible.
+        command: Command that reads the first of these setups again; empty if that is impossible.
         places: Places of the closing readings.
         severity: Severity of the finding.
     """
@@ -291,13 +291,14 @@ def differing_closings(
         where = f", {spans(known, 'line')}" if known else ""
         described.append(f"{name} ({signed(difference / MM)} mm{where})")
     noun = "setup" if len(setups) == 1 else "setups"
+    remedy = f"read the setup again: {command}" if command else "omit the setup"
     return Finding(
         "differing closing reading",
         severity,
         f"The closing reading differs from the first one by more than {usual / MM:.2g} mm in "
         f"{noun} {joined(described)}. The gauge or the machine was displaced, or a reading is "
         "wrong.",
-        f"Check both readings. If they are right, {restart or 'omit the setup'}.",
+        f"Check both readings. If they are right, {remedy}.",
         {"largest_difference_mm": max(abs(d) for _, d, _ in setups) / MM},
         tuple(places),
     )

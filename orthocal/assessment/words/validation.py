@@ -38,6 +38,7 @@ def larger_than_predicted(
     firmware: bool,
     numbers: Mapping[str, float],
     place: Place,
+    command: str,
 ) -> Finding:
     """Finding about deviations that are larger than predicted.
 
@@ -50,6 +51,7 @@ def larger_than_predicted(
         firmware: Whether a printer with its settings is validated.
         numbers: Numbers of the finding.
         place: Reading with the largest deviation.
+        command: Command that reads its setup again; empty if it is not in a file.
     """
     text = (
         f"The new readings deviate from the predictions by {mm(achieved)} mm RMS (limit "
@@ -60,10 +62,9 @@ def larger_than_predicted(
         if explains:
             where = "other settings were active" if firmware else "a gauge was mounted elsewhere"
             cause = f"a reading is wrong, {where} than stated, or the machine has changed"
-            repeat = (
-                "Probe again" if firmware else f"Repeat setup {place.setup}, which deviates most"
-            )
-            action = f"{repeat}, and validate again. If nothing changes, "
+            repeat = f"Read setup {place.setup} again, which deviates most"
+            repeat = "Probe again" if firmware else f"{repeat}: {command}" if command else repeat
+            action = f"{repeat}. Then validate again. If nothing changes, "
             action += RECALIBRATE_PRINTER if firmware else RECALIBRATE
         else:
             cause = "the readings scatter more than before, or something moved during the session"

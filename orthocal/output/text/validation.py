@@ -46,6 +46,11 @@ DETAILS: tuple[FindingKind, ...] = (
 )
 """Kinds of findings that are printed only with all readings, unless they decide."""
 
+EXPECTED_NOTE = (
+    "expected: average of all deviations within the uncertainty. The limit belongs to these "
+    "deviations: those of well-predicted readings count more."
+)
+"""Meaning of the column `expected`, and why the limit can be smaller."""
 
 MORE = "--details prints deviations and all readings."
 
@@ -138,7 +143,7 @@ def _details(validation: Validation, *, all_rows: bool) -> list[RenderableType]:
         key=lambda r: abs(r.deviation),
     )
     return [
-        section("Measured less predicted", deviations),
+        section("Measured less predicted", noted(deviations, EXPECTED_NOTE)),
         section("Readings of the new session", readings),
         *([section("Evidence", bullets(evidence))] if evidence else []),
     ]
