@@ -23,7 +23,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Session
+from orthocal.session.session import Session, split_label
 from orthocal.statistics.zeros import project_out_zeros
 
 STANDSTILL = 1e-6
@@ -89,13 +89,25 @@ def _excess(finding: Finding) -> float:
     return max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf
 
 
+def describe_gauge(calibration: Calibration, name: str) -> str:
+    """Attribute for readings of a gauge, such as " of the gauge 'dial'"; "" if it is the only one.
+
+    The only gauge of one of several sessions is named by its session.
+    """
+    if len(calibration.gauges) < 2:
+        return ""
+    label, within = split_label(name, joined=bool(calibration.session.parts))
+    if not within and label:
+        return f" of session {label}"
+    return f" of the gauge '{within}'" + (f" of session {label}" if label else "")
+
+
 def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
     """Finding about the residuals of one gauge."""
     noise, stated = gauge.noise, gauge.sigma
-    several = len(calibration.gauges) > 1
+    of_gauge = describe_gauge(calibration, gauge.name)
     row_noun = "a difference" if calibration.rows_are_differences else "a reading"
-    if several:
-        row_noun += f" of the gauge '{gauge.name}'"
+    row_noun += of_gauge
 
     def excess(reference: float, source: str) -> Finding:
         return words.model_error(
@@ -113,8 +125,7 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
         and noise.exceeds_residuals(stated)
         and noise.residual_sigma < LARGEST_OVERSTATED * stated
     ):
-        name = gauge.name if several else ""
-        return words.gauge_overstated(noise.residual_sigma, stated, name)
+        return words.gauge_overstated(noise.residual_sigma, stated, of_gauge)
     if noise.source == "unknown":
         return words.noise_unknown()
     if noise.source == "gauge":

@@ -8,6 +8,7 @@ import pytest
 from calibrated import EXPERIMENT_2, calibrated
 
 from orthocal import calibrate, draw_errors, simulate_session, summarize
+from orthocal.assessment.fit_findings import describe_gauge
 
 QUICK = {"solver": "variable-projection"}
 
@@ -110,6 +111,23 @@ def test_a_fit_is_explained(raw_cycles, experiment_2, case):
     for name, value in numbers.items():
         assert found.numbers[name] == pytest.approx(value, rel=0.02)
     assert " ".join(found.text.split()) in " ".join(summarize(result, details=True).split())
+
+
+@pytest.mark.parametrize(
+    ("joined", "names", "attribute"),
+    [
+        (False, ("",), ""),
+        (False, ("dial", "bar"), " of the gauge 'dial'"),
+        (True, ("second",), ""),
+        (True, ("second", "first"), " of session second"),
+        (True, ("second/dial", "first/dial"), " of the gauge 'dial' of session second"),
+    ],
+)
+def test_a_gauge_of_several_is_named(table1, joined, names, attribute):
+    gauges = tuple(replace(table1.gauges[0], name=name) for name in names)
+    record = replace(table1.session, parts=(table1.session,) * (2 * joined))
+    calibration = replace(table1, gauges=gauges, session=record)
+    assert describe_gauge(calibration, names[0]) == attribute
 
 
 def test_a_prior_marks_what_the_readings_leave_open():

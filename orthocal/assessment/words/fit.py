@@ -113,15 +113,14 @@ def model_error(
     )
 
 
-def gauge_overstated(sigma: float, stated: float, gauge: str) -> Finding:
+def gauge_overstated(sigma: float, stated: float, of_gauge: str) -> Finding:
     """Finding that the residuals are far smaller than the stated noise.
 
     Args:
         sigma: Standard deviation of a reading from the residuals, [m].
         stated: That of the gauge, [m].
-        gauge: Name of the gauge; empty if there is only one.
+        of_gauge: Attribute that names the gauge; empty if there is only one.
     """
-    of_gauge = f" of the gauge '{gauge}'" if gauge else ""
     return note(
         "gauge overstated",
         f"The residuals{of_gauge} are only {sigma / stated:.2g} of the stated noise: the stated "
