@@ -131,8 +131,10 @@ def test_session_with_active_offsets_is_to_be_validated(folder, run):
         stream.write("controller: {offsets_mm: [1.2, 0, 0]}\n")
     _, out, _ = run(folder, *sound_readings(folder))
     assert "All 6 readings are recorded." in out
-    assert f"  orthocal validate CALIBRATION {folder}\n" in out
+    assert f"by their calibration,\n  orthocal validate CALIBRATION {folder}\n" in out
     assert out.rstrip().endswith(f"sessions together:\n  orthocal calibrate EARLIER {folder}")
+    (folder / "sheet.html").touch()
+    assert "by their calibration (sheet.html names it),\n" in run(folder)[1]
 
 
 def test_instructions_of_a_setup_and_a_posture(folder, run):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +61,7 @@ def again(
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import note_wrong_order, require_entering
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+    from orthocal.output.text.answer import quote_path
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
@@ -76,15 +76,7 @@ def again(
     else:
         joints = read_controller_joints(ini, result.robot)
         new = replace(new, compensation=joints.compensation)
-    comment = (
-        "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
-        "readings.csv. Compare the readings with the calibration by `orthocal validate`."
-    )
-    validated = shlex.quote(os.path.relpath(calibration, out))
-    sheet, problem = sheet_or_problem(new, following=f"orthocal validate {validated} .")
-    if problem:
-        put_note(problem)
-    orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
+    _write(new, out, f"orthocal validate {quote_path(os.path.relpath(calibration, out))} .")
     if order := note_wrong_order(result):
         put_note(order)
     if amounts:
@@ -92,8 +84,27 @@ def again(
         put_out(f"Set these adjustments before you measure: {settings}.")
     put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
     _note_other_lines(result, new, ini, joints)
-    put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
+    folder, validated = quote_path(out), quote_path(calibration)
+    put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
+
+
+def _write(new: orthocal.Session, out: Path, validating: str) -> None:
+    """Write the planned session with its sheet.
+
+    Args:
+        new: The session.
+        out: Its directory.
+        validating: Command that compares its readings with the calibration, in this directory.
+    """
+    comment = (
+        "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
+        f"readings.csv. Compare the readings with the calibration:\n{validating}"
+    )
+    sheet, problem = sheet_or_problem(new, following=validating)
+    if problem:
+        put_note(problem)
+    orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
 
 
 def _note_other_lines(

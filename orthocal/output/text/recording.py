@@ -8,6 +8,7 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
@@ -24,6 +25,7 @@ from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
+from orthocal.output.sheet.page import SHEET
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name
@@ -436,8 +438,9 @@ class RecordingText:
         if warnings:
             following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
         elif session.controller_offsets is not None and any(session.controller_offsets):
+            which = " (sheet.html names it)" * (Path(path) / SHEET).is_file()
             following = (
-                "Next: validate the offsets that were entered, by their calibration,\n"
+                f"Next: validate the offsets that were entered, by their calibration{which},\n"
                 f"  orthocal validate CALIBRATION {command}\n"
                 f"or calibrate all sessions together:\n  orthocal calibrate EARLIER {command}"
             )
