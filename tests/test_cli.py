@@ -168,8 +168,9 @@ def test_again_writes_the_same_plan_with_active_offsets(calibrated, experiment, 
     assert (second.title, second.source) == (first.title, "")
     assert "x_slide -0.527 mm" in text
     assert f"orthocal validate {calibrated} {out}" in text
-    validated = f"<code>orthocal validate {os.path.relpath(calibrated, out)} .</code>"
-    assert validated in (out / "sheet.html").read_text()
+    validated = f"orthocal validate {os.path.relpath(calibrated, out)} ."
+    assert f"<code>{validated}</code>" in (out / "sheet.html").read_text()
+    assert f"# {validated}\n" in (out / "session.yaml").read_text()
     code, _, err = orthocal("again", calibrated, "--out", out)
     assert code == 2
     assert err == f"orthocal: {out}/session.yaml: exists already; --force overwrites it\n"
