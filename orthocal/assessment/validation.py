@@ -114,8 +114,8 @@ class Validation:
     """Probability of deviations at least as large as the measured ones; NaN if the calibration
     predicts nothing."""
     refit: Calibration
-    """Fit of the same parameters to the new readings, with its assessment. Its deviations refer to
-    the calibrated machine."""
+    """Fit of the same parameters to the new readings, not assessed. Its deviations refer to the
+    calibrated machine."""
     joint: Calibration | None
     """Joint calibration from all sessions with its assessment; None if the calibration is not
     confirmed."""
@@ -302,13 +302,12 @@ def _apply_stated(
 
 
 def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration]:
-    """Fit and assessed calibration of new readings.
+    """Fit and calibration of new readings.
 
     The nominal readings of the calibration are the predicted ones.
     """
     fit = repeat_fit(calibration, session)
-    refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
-    return fit, replace(refit, assessment=assess(refit, session))
+    return fit, assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
 
 
 def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:
@@ -444,7 +443,7 @@ def _describe_agreement(
     """Finding about the agreement of the deviations with their prediction.
 
     Args:
-        refit: Calibration of the new readings, assessed.
+        refit: Calibration of the new readings.
         fit: Its fit.
         test: Test of the deviations.
         expected: Predicted RMS of the deviations, [m].
