@@ -23,6 +23,9 @@ from orthocal.session.session import Gauge
 from orthocal.statistics.information import decompose
 
 SIGMA = 5e-6
+EXACT_SIGMA = 3e-8
+"""Stated noise of exact readings, [m]."""
+
 OFFSETS = {"*.offset_mm": 4.0}
 IN_SI = {"*.offset": 2e-3}
 QUICK = SolverOptions("variable-projection")
@@ -97,7 +100,7 @@ def test_exact_readings_give_the_tool_where_they_determine_it(machines):
     """Points and directions whose posterior is below 0.3 µm are right to 1 µm."""
     m, problem = machines, machines.problem
     truth = m.draw(7)
-    plan = m.plan.with_gauge(Gauge(None, None, None))  # without rounding
+    plan = m.plan.with_gauge(Gauge(EXACT_SIGMA, None, None))  # without rounding
     session = plan.with_values(problem.observations.rows(problem.predict(truth)))
     again = build_problem(session, free=JOINTS, prior=True, prior_stds=IN_SI)
     fit = fit_problem(again, options=QUICK)
