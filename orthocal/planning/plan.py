@@ -299,14 +299,19 @@ def _search_setups(
                 options, starts=work.starts, workers=work.workers, report=report
             )
     else:
-        counts = options[0]
+        counts, first = options[0], None
         if len(options) > 1:
-            counts = _choose_counts(search, work.seed, work.workers, options)
+            counts, first = _choose_counts(search, work.seed, work.workers, options)
         work.report(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
 
         def choose(weighted: SetupSearch) -> PlannedSetups:
             return weighted.choose(
-                counts, seed=work.seed, starts=work.starts, workers=work.workers, report=report
+                counts,
+                seed=work.seed,
+                starts=work.starts,
+                workers=work.workers,
+                report=report,
+                first=first if weighted is search else None,
             )
 
     of_approach = _find_approach_parameters(candidates, candidates.session.robot)
@@ -484,18 +489,22 @@ def _list_counts(
 
 def _choose_counts(
     search: SetupSearch, seed: int, workers: int, options: Sequence[list[int]]
-) -> list[int]:
-    """Numbers of readings of each setup with the smallest error after one start."""
-    error_of = partial(_quick_error, search, seed, options)
-    errors = dict(run_in_parallel(error_of, range(len(options)), workers, killed=KILLED))
-    return options[best_of(range(len(options)), lambda i: -errors[i])]
+) -> tuple[list[int], PlannedSetups | None]:
+    """Numbers of readings of each setup with the smallest error after one start, and its plan."""
+    start = partial(_start, search, seed, options)
+    plans = dict(run_in_parallel(start, range(len(options)), workers, killed=KILLED))
+    errors = [math.inf if (plan := plans[i]) is None else plan.error for i in range(len(options))]
+    best = best_of(range(len(options)), lambda i: -errors[i])
+    return options[best], plans[best]
 
 
-def _quick_error(search: SetupSearch, seed: int, options: Sequence[list[int]], which: int) -> float:
-    """Error after one start; infinite without a plan."""
+def _start(
+    search: SetupSearch, seed: int, options: Sequence[list[int]], which: int
+) -> PlannedSetups | None:
+    """Plan after one start; None without a plan."""
     with suppress(ParameterError):
-        return search.choose(options[which], seed=seed, starts=1).error
-    return math.inf
+        return search.choose(options[which], seed=seed, starts=1)
+    return None
 
 
 def _simplify(

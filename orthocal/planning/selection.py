@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from typing import cast
 
 import numpy as np
@@ -162,6 +162,7 @@ class SetupSearch:
         starts: int | None = None,
         workers: int = 1,
         report: Callable[[int, float], None] | None = None,
+        first: PlannedSetups | None = None,
     ) -> PlannedSetups:
         """Choose setups with stated numbers of readings and the smallest expected error.
 
@@ -172,6 +173,7 @@ class SetupSearch:
                 candidates.
             workers: Number of processes; the result does not depend on it.
             report: Called after each start with its number and the smallest error so far.
+            first: Result of the first start, if it is known.
         """
         if starts is None:
             starts = MIN_TOTAL_CANDIDATES // self.candidates.count
@@ -179,10 +181,12 @@ class SetupSearch:
         if starts < 1:
             raise ValueError("expected at least one start")
         drawn = self._draw_starts(counts, seed, starts)
+        known = [] if first is None else [(0, first)]
         done: dict[int, PlannedSetups] = {}
         reported, best = 0, None
         work = partial(_run, self, drawn)
-        for start, setups in run_in_parallel(work, range(starts), workers, killed=KILLED):
+        searched = run_in_parallel(work, range(len(known), starts), workers, killed=KILLED)
+        for start, setups in chain(known, searched):
             done[start] = setups
             while reported in done:
                 if best is None or is_less(done[reported].error, best.error):
