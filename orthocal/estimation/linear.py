@@ -201,15 +201,13 @@ class LinearProblem:
             mean = problem.prior_mean / problem.theta_scale
             jacobian = np.vstack([jacobian / sigma, np.diag(weight)])
             residual = np.concatenate([residual / sigma, weight * (mean - reference)])
-        selection = problem.selection
-        lower, upper = selection.lower, selection.upper
-        if np.isfinite(lower).any() or np.isfinite(upper).any():
+        bounds = problem.selection.lower, problem.selection.upper
+        lower, upper = (b / problem.theta_scale - reference for b in bounds)
+        step = np.linalg.lstsq(jacobian, residual, rcond=RANK_THRESHOLD)[0]
+        if ((step < lower) | (step > upper)).any():
             from scipy.optimize import lsq_linear
 
-            limits = [b / problem.theta_scale - reference for b in (lower, upper)]
-            step = lsq_linear(jacobian, residual, bounds=limits, method="bvls").x
-        else:
-            step = np.linalg.lstsq(jacobian, residual, rcond=RANK_THRESHOLD)[0]
+            step = lsq_linear(jacobian, residual, bounds=(lower, upper), method="bvls").x
         return np.asarray((reference + step) * problem.theta_scale)
 
 
