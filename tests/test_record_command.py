@@ -227,6 +227,16 @@ ENTRIES = {
     "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: line 2"),
     "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Line 4: yx x_min (4 of 5 missing)"),
     "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Line 4: yx x_min (4 of 5 missing)"),
+    "again of a dropped row": (
+        ["0.1", "drop 3", "again 3", "0.2"],
+        ["0.10", "", "", "", "", "0.20"],
+        "`again 3` adds it at the end. Line 4: yx x_min (4 of 5 missing)",
+    ),
+    "again of a dropped row twice": (
+        ["drop 3", "again 3", "again 3"],
+        [""] * 6,
+        "Added: line 8, yx x_max. Line 8: yx x_max (6 of 6 missing)",
+    ),
     "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
     "restart of an earlier setup": (
         ["0.1", "0.2", "0.3", "0.4", "restart 3", "0.5"],

@@ -20,7 +20,7 @@ from orthocal.assessment.plausibility import (
     find_implausible,
     find_impossible_gauges,
 )
-from orthocal.assessment.repeated_readings import find_differing_closings, find_scattered
+from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import (
     describe_anomalies,
@@ -120,18 +120,12 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
             scale_findings = [_describe_beyond(session, scale.factor)]
         elif scale.factor > 1.0:
             scale_findings = [words.above_tolerances(scale.factor)]
-    closings = [] if mistakes else find_differing_closings(session)
     sound = verdict_of([*mistakes, *implausible, *scale_findings]) == "enter"
     no_change = [_describe_detectable(session)] if session.joined and sound else []
     order = _describe_order(session) if session.joined else []
     unshown_effects = find_unshown_effects(session)
     return Judgement(
-        rank(
-            [
-                *(*implausible, *mistakes, *closings, *order),
-                *(*no_change, *scale_findings, *unshown_effects),
-            ]
-        ),
+        rank([*implausible, *mistakes, *order, *no_change, *scale_findings, *unshown_effects]),
         scale,
     )
 

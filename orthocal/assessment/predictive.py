@@ -25,6 +25,7 @@ from orthocal.calibration.refit import restore_mounting_covariance
 from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
+from orthocal.observation.observations import Observations
 from orthocal.session.session import known_approach, split_label
 from orthocal.statistics.chance import BY_CHANCE
 from orthocal.statistics.distributions import (
@@ -56,6 +57,8 @@ class DeviationTest:
     critical_factor: float
     """Factor of the deviations at which `p_value` is BY_CHANCE: above 1 if they are as predicted.
     NaN if unknown."""
+    worst_setup: int = 0
+    """Index of the setup without which the others agree best with their prediction."""
 
 
 def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
@@ -82,7 +85,7 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
     variances, directions = np.linalg.eigh(covariance)
     root = directions * np.sqrt(np.maximum(variances, 0.0))
     centre = np.append([p.value for p in calibration.free], problem.prior_mean[n:])
-    square = _least_square(fit, centre, root, noise.sigma)
+    square, worst_setup = _least_square(fit, centre, root, noise.sigma)
 
     def p_value(factor: float) -> float:
         scaled = square * factor**2
@@ -91,7 +94,7 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
         return f_tail(dof, noise.dof, scaled / dof)
 
     critical_factor = least_number(lambda f: p_value(f) < BY_CHANCE) if square > 0.0 else math.nan
-    return DeviationTest(p_value(1.0), critical_factor)
+    return DeviationTest(p_value(1.0), critical_factor, worst_setup)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +148,10 @@ def _of_calibration(calibration: Calibration, gauge: GaugeRecord) -> tuple[float
     return noise.residual_sigma, noise.residual_dof
 
 
-def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> float:
-    """Least |y − h(x)|²/σ² + |z|² over x = centre + root z, by Gauss-Newton steps from the fit.
+def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> tuple[float, int]:
+    """Least |y − h(x)|²/σ² + |z|² over x = centre + root z, and the setup that increases it most.
+
+    It is found by Gauss-Newton steps from the fit.
 
     Args:
         fit: Fit to the new readings.
@@ -175,6 +180,7 @@ def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> float:
     z, before, best = least(deviation, jacobian), np.zeros(len(root)), math.inf
     residual = deviation - jacobian @ root @ z
     linear = float(residual @ residual + z @ z)
+    reached = residual, jacobian @ root
     for _ in range(MAX_STEPS):
         try:
             closed, (residual, jacobian) = linearise(centre + scale * (root @ z), passive)
@@ -186,10 +192,33 @@ def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> float:
             continue
         converged = best - square < SMALL_DECREASE
         before, best, passive = z, square, closed
+        reached = residual, jacobian @ root
         if converged:
             break
         z = least(residual + jacobian @ root @ z, jacobian)
-    return best if math.isfinite(best) else linear
+    return best if math.isfinite(best) else linear, _find_worst_setup(*reached, o)
+
+
+def _find_worst_setup(residual: Array, along: Array, observations: Observations) -> int:
+    """Index of the setup whose readings increase the least χ² with the smallest probability.
+
+    Without the entries S of a setup χ² decreases by r_Sᵀ (I − H_SS)⁻¹ r_S, with H the matrix of
+    fitted values.
+
+    Args:
+        residual: Residuals r at the least χ², zeros projected out, shape (n_entries,), [σ].
+        along: Their derivatives with respect to z, shape (n_entries, n_free), [σ].
+        observations: The entries.
+    """
+    covariance = np.linalg.inv(along.T @ along + np.eye(along.shape[1]))
+    probabilities: dict[int, float] = {}
+    for setup in np.unique(observations.setup).tolist():
+        entries = np.flatnonzero(observations.setup == setup)
+        rows, r = along[entries], residual[entries]
+        unfitted = np.eye(len(entries)) - rows @ covariance @ rows.T
+        decrease = float(r @ np.linalg.solve(unfitted, r))
+        probabilities[setup] = chi_square_tail(len(entries), decrease)
+    return min(probabilities, key=lambda setup: probabilities[setup])
 
 
 def expect_rms(calibration: Calibration, fit: Fit) -> float:

@@ -13,17 +13,20 @@ from orthocal.assessment.plausibility import name_if_several
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, command_to_restart, place_of
-from orthocal.calibration.assessment_record import Finding, Severity
-from orthocal.estimation.weighting import stated_sigma
+from orthocal.calibration.assessment_record import Finding
+from orthocal.estimation.weighting import stated_sigma, usual_difference
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.motion.approach import label_reading
 from orthocal.session.session import Session
-from orthocal.statistics.chance import chance_of_excess
+from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 from orthocal.units import MM
 
 MISTAKE_PROBABILITY = 1e-6
 """Probability by chance below which differences of repeated readings are a mistake."""
+
+ROUNDING_ERROR = 1e-9
+"""Rounding error of a difference of two readings, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,25 +57,10 @@ def find_scattered(session: Session) -> tuple[Finding, ...]:
     for part in split_sessions(session):
         for gauge in part.gauges:
             repeats = _list_repeats(part, gauge)
-            if moved := _find_moved(repeats, part.gauges[gauge].usual_difference):
+            if moved := _find_moved(repeats, usual_difference(part.gauges[gauge])):
                 findings.append(_describe_closings(session, part, gauge, moved))
             elif _is_scattered(repeats):
                 findings.append(_describe_scatter(part, gauge, repeats))
-    return tuple(findings)
-
-
-def find_differing_closings(session: Session) -> tuple[Finding, ...]:
-    """Notes about closing readings that differ from the first ones more than the sheet allows."""
-    findings = []
-    for part in split_sessions(session):
-        for name, gauge in part.gauges.items():
-            differing = [
-                r
-                for r in _list_repeats(part, name)
-                if r.is_closing and abs(r.difference) > gauge.usual_difference
-            ]
-            if differing:
-                findings.append(_describe_closings(session, part, name, differing, severity="note"))
     return tuple(findings)
 
 
@@ -114,8 +102,8 @@ def _find_moved(repeats: Sequence[_Repeats], usual: float) -> list[_Repeats]:
         r
         for r in repeats
         if r.is_closing
-        and abs(r.difference) > usual
-        and chance_of_excess(r.square, r.dof) * len(repeats) <= MISTAKE_PROBABILITY
+        and abs(r.difference) > usual + ROUNDING_ERROR
+        and chance_of_excess(r.square, r.dof) * len(repeats) <= BY_CHANCE
     ]
     if len(moved) > max(1, len(repeats) // 2):
         return []
@@ -152,7 +140,6 @@ def _describe_closings(
     part: Session,
     gauge: str,
     closings: Sequence[_Repeats],
-    severity: Severity = "review",
 ) -> Finding:
     """Finding about closing readings that differ from the first ones.
 
@@ -160,8 +147,7 @@ def _describe_closings(
         session: All sessions.
         part: The session of the closing readings.
         gauge: Name of their gauge.
-        closings: The setups, each with its first and closing reading.
-        severity: Severity of the finding.
+        closings: Repeated first readings of setups that end with a closing reading.
     """
     last = [int(r.rows[-1]) for r in closings]
     setups = [
@@ -170,8 +156,7 @@ def _describe_closings(
     ]
     return words.differing_closings(
         setups,
-        part.gauges[gauge].usual_difference,
+        usual_difference(part.gauges[gauge]),
         command_to_restart(session, part.readings[last[0]]),
         [place_of(part, i) for i in last],
-        severity=severity,
     )

@@ -240,7 +240,11 @@ def validate_calibration(
     entries, notes = _choose_entries(calibration, joint, all_sessions, mistake)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
-    notes += _describe_comparison(repetition, test, stated=stated)
+    if judgement.verdict == "enter":  # residuals of wrong readings mean nothing
+        exceeded = _is_expected(test.p_value) is False
+        notes.append(words.describe_repetition(repetition, exceeded=exceeded))
+    if not stated:
+        notes.append(words.controller_assumed())
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
@@ -260,15 +264,6 @@ def validate_calibration(
             () if joint is None else assessment_of(joint).backlash,
         ),
     )
-
-
-def _describe_comparison(
-    repetition: Repetition, test: DeviationTest, *, stated: bool
-) -> list[Finding]:
-    """Findings about repeated residuals, and about active offsets that no session states."""
-    exceeded = _is_expected(test.p_value) is False
-    repeated = words.describe_repetition(repetition, exceeded=exceeded)
-    return [repeated] if stated else [repeated, words.controller_assumed()]
 
 
 def _apply_stated(
@@ -413,8 +408,8 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     if differences:
         verdict = assessment_of(calibration).decision.verdict
         advice = (
-            "The session was not measured with the offsets to enter: enter them, measure again, "
-            "and validate that session"
+            "The session was not measured with the offsets to enter: calibrate it together with "
+            "the earlier ones, or enter these offsets, measure again, and validate that session"
             if verdict == "enter"
             else f"The verdict of the calibration is '{verdict}': its offsets are not to be "
             "entered, so no session validates it"
@@ -464,8 +459,9 @@ def _describe_agreement(
     if as_expected is None:
         return words.nothing_predicted(numbers)
     if not as_expected:
-        largest = int(np.argmax([abs(r.deviation) for r in refit.residuals]))
         session = fit.problem.session
+        worst = list(session.setups)[test.worst_setup]
+        row = next(i for i, r in enumerate(session.readings) if r.setup == worst)
         finding = words.larger_than_predicted(
             achieved,
             limit,
@@ -473,8 +469,8 @@ def _describe_agreement(
             explains=refit.rms_after < EXPLAINED_RATIO * achieved,
             firmware=refit.session.firmware is not None,
             numbers=numbers,
-            place=place_of(session, largest),
-            command=command_to_restart(session, session.readings[largest]),
+            place=place_of(session, row),
+            command=command_to_restart(session, session.readings[row]),
         )
         return replace(finding, severity="note") if explained else finding
     return words.as_predicted(achieved, limit, numbers)

@@ -505,7 +505,11 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
     listed = []
     for drive, lag in zip(result.robot.drives, lags.tolist(), strict=True):
         unit, factor = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(2.0 * lag / factor, 3)} {unit}")
+        shown = format_fixed(2.0 * lag / factor, 3)
+        if float(shown):
+            listed.append(f"{drive.name} {shown} {unit}")
+    if not listed:
+        return ""
     if by_program and describe_trims(result.robot, result.session.compensation):
         text = (
             "Where drives reverse, the program takes up the backlash that the controller does not"

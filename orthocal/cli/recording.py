@@ -147,6 +147,8 @@ class Dialogue:
         """Setup that was described last."""
         self._last: int | None = None
         """Index of the row that was read last."""
+        self._dropped: dict[str, list[Reading]] = {}
+        """Deleted rows by their line."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
 
@@ -441,7 +443,9 @@ class Dialogue:
             return
         if arguments and (name not in row_commands or len(arguments) > 1):
             raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
-        if name in row_commands:
+        if name == "again" and arguments and arguments[0] in self._dropped:
+            self._restore(arguments[0])
+        elif name in row_commands:
             row_commands[name](self._parse_row(arguments[0]) if arguments else None)
         elif name == "list":
             self._say(self._text.list_rows())
@@ -524,15 +528,25 @@ class Dialogue:
 
     def _drop(self, index: int | None) -> None:
         index = self._require_row() if index is None else index
-        row, count = self._recording.rows[index], len(self._recording.point(index))
+        rows = [self._recording.rows[i] for i in self._recording.point(index)]
+        row, count = self._recording.rows[index], len(rows)
         self._recording.drop(index)
+        self._dropped[str(row.line)] = rows
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - count
         self._note(
-            f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers."
+            f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers. "
+            f"`again {row.line}` adds it at the end."
         )
         self._judge()
         self._ask_for_next()
+
+    def _restore(self, line: str) -> None:
+        index = self._recording.restore(self._dropped[line])
+        del self._dropped[line]
+        row = self._recording.rows[index]
+        self._note(f"Added: line {row.line}, {self._text.label(row)}.")
+        self._ask_for(index)
 
     def _restart(self, index: int | None) -> None:
         if index is None:

@@ -32,6 +32,13 @@ from orthocal.statistics.zeros import project_out_zeros
 DEFAULT_SIGMA = 10e-6
 """Assumed noise of a gauge that does not state it, [m]."""
 
+USUAL_STDS = 4.0
+"""Largest usual difference of two readings of one posture, in standard deviations of a difference:
+of about 16,000 correct ones one is larger."""
+
+USUAL_STEPS = 3
+"""The same in steps of a gauge whose noise is not stated."""
+
 SMALLEST_SIGMA = 1e-9
 """Smallest standard deviation of a reading, [m]; below it readings count as perfect."""
 
@@ -75,6 +82,18 @@ def with_repeatability(
 def stated_sigma(gauge: Gauge) -> float:
     """Standard deviation of a reading from stated noise and resolution, [m]; 0 without both."""
     return noise_floor(gauge.sigma, gauge.resolution)
+
+
+def usual_difference(gauge: Gauge) -> float:
+    """Largest usual difference of two readings of one posture, [m]; 0 if unknown.
+
+    It is a multiple of the resolution.
+    """
+    step = gauge.resolution or 0.0
+    if not gauge.sigma:
+        return USUAL_STEPS * step
+    largest = USUAL_STDS * math.sqrt(2.0) * stated_sigma(gauge)
+    return max(math.floor(largest / step), 1) * step if step else largest
 
 
 def assumed_sigma(gauge: Gauge) -> float:

@@ -68,7 +68,7 @@ class Change(Keys):
 
     done: Literal["read", "emptied", "added", "dropped"]
     """Kind of change: `read` gives a row its value; `emptied` removes the values of all rows of its
-    setup; `added` appends a row that repeats it; `dropped` deletes it. The three rows of a point
+    setup; `added` appends another row after it; `dropped` deletes it. The three rows of a point
     change together."""
     rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
     """Keys of the row, or of the three rows of a point, then of as many added rows."""
@@ -312,6 +312,20 @@ class Recording:
         if len(self.rows) == len(rows):
             raise SessionError("it is the only row; a session has at least one")
         self._apply(Change(done="dropped", rows=[self.rows[i].key for i in rows]))
+
+    def restore(self, dropped: Sequence[Reading]) -> int:
+        """Append deleted rows without their readings, and return the index of the first.
+
+        Args:
+            dropped: A row, or the three rows of a point.
+
+        Raises:
+            SessionError: If such a row exists again.
+            OutputError: If the files cannot be written.
+        """
+        existing = [r.key for r in self.rows[: len(dropped)]]
+        self._apply(Change(done="added", rows=[*existing, *(_emptied(r).key for r in dropped)]))
+        return len(self.rows) - len(dropped)
 
     def empty(self, index: int) -> None:
         """Delete all readings of a row's setup, to be read again; the journal preserves them.

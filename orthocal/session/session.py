@@ -33,10 +33,6 @@ from orthocal.units import MM
 DISTANCE_DECIMALS = 9
 """Decimals in m and rad to which distances from the mechanical zero are compared."""
 
-USUAL_STEPS, USUAL_STDS = 2.0, 4.0
-"""Largest usual difference of two readings: in steps of the dial, or in standard deviations of a
-reading if that is more."""
-
 
 PostureForm = Literal["tcp", "joints"]
 """Kind of the commanded coordinates: of the tool centre point or of the drives."""
@@ -67,11 +63,6 @@ class Gauge:
     sigma: float | None = None
     resolution: float | None = None
     range: tuple[float, float] | None = None
-
-    @property
-    def usual_difference(self) -> float:
-        """Largest usual difference of two readings of one posture, [m]; 0 if unknown."""
-        return max(USUAL_STEPS * (self.resolution or 0.0), USUAL_STDS * (self.sigma or 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -143,11 +143,12 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in explanations)
     listed = ";\n".join(texts)
     action = _choose_factor(explanations) or _repeat(session, *explanations)
-    if all(e.kind == "reversed sign" and e.setups for e in explanations):  # nothing to read again
-        action = _remedy(
-            session,
-            replace(explanations[0], setups=tuple(n for e in explanations for n in e.setups)),
-        )
+    reversed_setups = [e for e in explanations if e.kind == "reversed sign" and e.setups]
+    if reversed_setups:  # nothing to read again
+        names = tuple(n for e in reversed_setups for n in e.setups)
+        remedy = _remedy(session, replace(reversed_setups[0], setups=names))
+        only = len(reversed_setups) == len(explanations)
+        action = remedy if only else f"{remedy} Otherwise {uncapitalised(action)}"
     if any(e.amounts for e in explanations):  # costs no reading
         effect = _effect_remedy(session, explanations)
         repeat = uncapitalised(action)
@@ -185,7 +186,8 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     text = capitalised(f"{_text(session, e)}.")
     others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
     if others:
-        text += f" The readings do not distinguish this from: {'; '.join(others)}."
+        listed = ";\n  ".join(dict.fromkeys([_text(session, e), *others]))
+        text = f"One of these may have happened:\n  {listed}."
     numbers = {"log_likelihood_ratio": anomaly.log_evidence}
     if e.amount is not None:
         for name in e.parameters:
@@ -711,7 +713,8 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
             f"notes: in `orthocal record {path}` {correct}"
         )
     moved = ""
-    if any(r.setup != session.readings[-1].setup for r in rows):
+    displaced = any(e.kind == "displaced gauge" for e in explanations)
+    if displaced or any(r.setup != session.readings[-1].setup for r in rows):
         moved = (
             f" If the gauge has been moved since, type `restart {line}`: it reads the setup again."
         )

@@ -13,7 +13,7 @@ from orthocal.assessment.wording import (
     signed,
     times,
 )
-from orthocal.calibration.assessment_record import Finding, Place, Severity
+from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.robot.parameters import Parameter
 from orthocal.text import spans
 from orthocal.units import MM, UM, show_limit
@@ -273,8 +273,6 @@ def differing_closings(
     usual: float,
     command: str,
     places: Sequence[Place],
-    *,
-    severity: Severity,
 ) -> Finding:
     """Finding about closing readings that differ from the first readings of their setups.
 
@@ -283,7 +281,6 @@ def differing_closings(
         usual: Largest usual difference, [m].
         command: Command that reads the first of these setups again; empty if that is impossible.
         places: Places of the closing readings.
-        severity: Severity of the finding.
     """
     described = []
     for name, difference, lines in setups:
@@ -291,14 +288,15 @@ def differing_closings(
         where = f", {spans(known, 'line')}" if known else ""
         described.append(f"{name} ({signed(difference / MM)} mm{where})")
     noun = "setup" if len(setups) == 1 else "setups"
-    remedy = f"read the setup again: {command}" if command else "omit the setup"
-    return Finding(
+    again = "read the setup again" if len(setups) == 1 else "read these setups again"
+    others = "" if len(setups) == 1 else ", likewise the others"
+    remedy = f"{again}: {command}{others}" if command else f"omit the {noun}"
+    return review(
         "differing closing reading",
-        severity,
         f"The closing reading differs from the first one by more than {usual / MM:.2g} mm in "
         f"{noun} {joined(described)}. The gauge or the machine was displaced, or a reading is "
         "wrong.",
         f"Check both readings. If they are right, {remedy}.",
-        {"largest_difference_mm": max(abs(d) for _, d, _ in setups) / MM},
-        tuple(places),
+        places,
+        largest_difference_mm=max(abs(d) for _, d, _ in setups) / MM,
     )

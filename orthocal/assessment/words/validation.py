@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from orthocal.assessment.predictive import MIN_ROWS, Repetition
-from orthocal.assessment.wording import joined, mm, note, parameter_places, review, signed
+from orthocal.assessment.wording import joined, mm, note, parameter_places, plain, review, signed
 from orthocal.calibration.assessment_record import ControllerEntry, Finding, Place
+from orthocal.units import MM
 
 CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
@@ -50,19 +51,16 @@ def larger_than_predicted(
         explains: Whether that fit explains the deviations.
         firmware: Whether a printer with its settings is validated.
         numbers: Numbers of the finding.
-        place: Reading with the largest deviation.
+        place: First reading of the setup without which the others agree best.
         command: Command that reads its setup again; empty if it is not in a file.
     """
-    text = (
-        f"The new readings deviate from the predictions by {mm(achieved)} mm RMS (limit "
-        f"{mm(limit)} mm)."
-    )
+    text = f"The new readings deviate from the predictions by {_with_limit(achieved, limit)}."
     action = ""
     if refit is not None:
         if explains:
             where = "other settings were active" if firmware else "a gauge was mounted elsewhere"
             cause = f"a reading is wrong, {where} than stated, or the machine has changed"
-            repeat = f"Read setup {place.setup} again, which deviates most"
+            repeat = f"Read setup {place.setup} again, which agrees least with the others"
             repeat = "Probe again" if firmware else f"{repeat}: {command}" if command else repeat
             action = f"{repeat}. Then validate again. If nothing changes, "
             action += RECALIBRATE_PRINTER if firmware else RECALIBRATE
@@ -78,10 +76,17 @@ def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) ->
     """Finding about deviations as predicted; arguments as for `larger_than_predicted`."""
     return note(
         "as predicted",
-        f"The new readings agree with the predictions: they deviate by {mm(achieved)} mm RMS "
-        f"(limit {mm(limit)} mm).",
+        "The new readings agree with the predictions: they deviate by "
+        f"{_with_limit(achieved, limit)}.",
         **numbers,
     )
+
+
+def _with_limit(achieved: float, limit: float) -> str:
+    """RMS of the deviations and its limit, with one more decimal if they are nearly equal."""
+    decimals = 3 if mm(achieved) != mm(limit) else 4
+    rms, largest = (plain(v / MM, decimals) for v in (achieved, limit))
+    return f"{rms} mm RMS (limit {largest} mm)"
 
 
 def further_change(entries: Sequence[ControllerEntry]) -> Finding:

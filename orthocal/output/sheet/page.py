@@ -11,6 +11,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
 from orthocal.effects.compensation import describe_trims
+from orthocal.estimation.weighting import usual_difference
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import approach_length, describe_approach
@@ -252,9 +253,9 @@ def _compare_closing(session: Session, motion: SetupMotion) -> str:
         return ""
     if last.repeats is None or last.approach != first.approach:
         return FROM_ANOTHER_SIDE
-    largest = session.gauges[setup.gauge].usual_difference
+    largest = usual_difference(session.gauges[setup.gauge])
     reading = "0" if first.role == "subtracted" else f"that of line {last.repeats}"
-    return END.format(reading, f"{_short(largest)} mm" if largest else "two steps of the dial")
+    return END.format(reading, f"{_short(largest)} mm" if largest else "three steps of the dial")
 
 
 def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:

@@ -52,7 +52,6 @@ MOST_LISTED = 4
 """Further findings that the short answer lists."""
 
 LISTED: tuple[FindingKind, ...] = (
-    "differing closing reading",
     "wrong order",
     "no change",
     "change unknown",
@@ -256,7 +255,10 @@ def _next_step(
                 "identified errors in LinuxCNC or in programs."
             )
         active = "" if unchanged else " --offsets active"
+        home = quote_path(f"{saved}-home")
+        offsets = f"orthocal export {directory} --to linuxcnc --offsets --ini FILE --out {home}"
         return words, (
+            *(() if unchanged else (offsets,)),
             f"orthocal export {directory} --to linuxcnc --out {module}",
             f"orthocal correct {directory} PROGRAM.ngc{active} --out CORRECTED.ngc",
         )
