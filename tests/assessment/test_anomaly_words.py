@@ -60,7 +60,7 @@ def test_an_action_that_costs_no_reading_comes_first(root):
     )
     for explanation, alternative, first in (
         (sign, backlash, "Calibrate with `--effects backlash`."),
-        (sign, setup, "Read "),
+        (sign, setup, "Look at the mounting of the gauge. "),
         (inches, point, "Take one of these readings again. "),
         (setup, other, "Look at the mounting of the gauge. If a minus sign was forgotten, reverse"),
     ):
@@ -70,3 +70,32 @@ def test_an_action_that_costs_no_reading_comes_first(root):
         )
         assert finding.kind == "ambiguous"
         assert finding.action.startswith(first)
+
+
+def test_a_setup_whose_gauge_may_have_moved_is_read_again(root):
+    """Also the last one, whose stand is still there."""
+    session = load_session(root / "examples/raw-cycles")
+    last = tuple(range(len(session.readings)))[-2:]
+    names = (session.readings[last[0]].setup,)
+    displaced = Explanation("displaced gauge", "reading", rows=last, names=names)
+    sign = Explanation("reversed sign", "reading", rows=last[:1], factor=-1.0)
+    anomaly = Anomaly(displaced, 9.0, None, alternatives=(sign,))
+    result = Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
+    (finding,) = describe_anomalies(session, result)
+    assert f"type `restart {session.readings[last[0]].line}`" in finding.action
+
+
+def test_changes_between_sessions_that_readings_do_not_distinguish_are_listed(root):
+    session = load_session(root / "examples/raw-cycles")
+    drive = session.robot.drives[0].name
+    missing, twice = (
+        Explanation(kind, "session", drives=(drive,), sessions=("second",))
+        for kind in ("offsets not entered", "offsets entered twice")
+    )
+    result = Anomalies(
+        (Anomaly(missing, 9.0, None, alternatives=(twice,)),), 9.0, True, 1e-4, 1e-5, 1.0, 1.0
+    )
+    (finding,) = describe_anomalies(session, result)
+    first, *listed = finding.text.splitlines()
+    assert first == "One of these may have happened:"
+    assert [drive in line for line in listed] == [True, True]

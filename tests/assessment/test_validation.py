@@ -12,6 +12,7 @@ import pytest
 from calibrated import UNJUDGED, calibrated, identified, plan_of, session_of
 from effect_plans import FEW, effect_plan
 from models import TRUTH
+from planned import quick_plan
 from scipy.stats import binom
 from scipy.stats import t as student
 from tolerances import THREE_DECIMALS_MM
@@ -38,6 +39,7 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.predictive import Repetition, judge_deviations, measure_repetition
 from orthocal.assessment.validation import ENTRY_KINDS
 from orthocal.assessment.wording import join_texts
+from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
@@ -335,6 +337,35 @@ def test_a_change_that_keeps_the_offsets_is_found_by_validation_alone(plan):
     place = f"{worst.setup} {worst.posture}"
     assert place in " ".join(summarize(result, details=True).split())
     assert place not in " ".join(summarize(result).split())
+
+
+def test_the_setup_to_read_again_is_the_one_that_disagrees_with_the_others():
+    """Not that of the largest deviation: its reading may only be predicted less well."""
+    plan, named, unconfirmed = quick_plan().session, 0, 0
+    for seed in range(4):
+        errors = draw_machine(plan.robot, seed)
+        calibration = calibrate(simulate_session(plan, errors, seed=seed).session, **UNJUDGED)
+        entered = plan.with_controller(entered_offsets(calibration))
+        session = simulate_session(entered, errors, seed=seed + 1000).session
+        setup = list(session.setups)[seed % len(session.setups)]
+        values = session.values
+        displaced = [i for i, r in enumerate(session.readings) if r.setup == setup][1:-1]
+        values[displaced] += 0.15e-3
+        fit = repeat_fit(calibration, session.with_values(values))
+        test = judge_deviations(calibration, fit)
+        if test.p_value < BY_CHANCE:
+            unconfirmed += 1
+            named += list(fit.problem.session.setups)[test.worst_setup] == setup
+    assert named == unconfirmed >= 3
+
+
+def test_number_and_limit_are_printed_differently():
+    for achieved, limit, text in (
+        (26.4e-6, 25.6e-6, "0.0264 mm RMS (limit 0.0256 mm)"),
+        (26e-6, 22e-6, "0.026 mm RMS (limit 0.022 mm)"),
+    ):
+        finding = words.as_predicted(achieved, limit, {})
+        assert finding.text.endswith(f"by {text}.")
 
 
 @pytest.mark.parametrize(
