@@ -202,21 +202,21 @@ def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> tuple[f
 def _find_worst_setup(residual: Array, along: Array, observations: Observations) -> int:
     """Index of the setup whose readings increase the least χ² with the smallest probability.
 
-    Without the entries S of a setup χ² decreases by r_Sᵀ (I − H_SS)⁻¹ r_S, with H the matrix of
-    fitted values.
+    Without the entries S of a setup χ² decreases by r_Sᵀ (I − H_SS)⁻¹ r_S, with H = A (Aᵀ A + I)⁻¹ Aᵀ
+    for the derivatives A. This is |r_S|² + r_Sᵀ A_S (Aᵀ A + I − A_Sᵀ A_S)⁻¹ A_Sᵀ r_S.
 
     Args:
         residual: Residuals r at the least χ², zeros projected out, shape (n_entries,), [σ].
-        along: Their derivatives with respect to z, shape (n_entries, n_free), [σ].
+        along: Derivatives of the readings with respect to z, shape (n_entries, n_free), [σ].
         observations: The entries.
     """
-    covariance = np.linalg.inv(along.T @ along + np.eye(along.shape[1]))
+    information = along.T @ along + np.eye(along.shape[1])
     probabilities: dict[int, float] = {}
     for setup in np.unique(observations.setup).tolist():
         entries = np.flatnonzero(observations.setup == setup)
         rows, r = along[entries], residual[entries]
-        unfitted = np.eye(len(entries)) - rows @ covariance @ rows.T
-        decrease = float(r @ np.linalg.solve(unfitted, r))
+        fitted = np.linalg.solve(information - rows.T @ rows, rows.T @ r)
+        decrease = float(r @ r + (rows.T @ r) @ fitted)
         probabilities[setup] = chi_square_tail(len(entries), decrease)
     return min(probabilities, key=lambda setup: probabilities[setup])
 
