@@ -202,8 +202,8 @@ def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> tuple[f
 def _find_worst_setup(residual: Array, along: Array, observations: Observations) -> int:
     """Index of the setup whose readings increase the least χ² with the smallest probability.
 
-    Without the entries S of a setup χ² decreases by |r_S|² + r_Sᵀ A_S (Aᵀ A + I − A_Sᵀ A_S)⁻¹ A_Sᵀ r_S
-    with the derivatives A. This is r_Sᵀ (I − H_SS)⁻¹ r_S with H = A (Aᵀ A + I)⁻¹ Aᵀ.
+    Without the entries S of a setup χ² decreases by r_Sᵀ (I − H_SS)⁻¹ r_S with
+    H = A (Aᵀ A + I)⁻¹ Aᵀ and the derivatives A: |r_S|² + r_Sᵀ A_S (Aᵀ A + I − A_Sᵀ A_S)⁻¹ A_Sᵀ r_S.
 
     Args:
         residual: Residuals r at the least χ², zeros projected out, shape (n_entries,), [σ].
