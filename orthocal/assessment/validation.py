@@ -240,11 +240,7 @@ def validate_calibration(
     entries, notes = _choose_entries(calibration, joint, all_sessions, mistake)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
-    if judgement.verdict == "enter":  # residuals of wrong readings mean nothing
-        exceeded = _is_expected(test.p_value) is False
-        notes.append(words.describe_repetition(repetition, exceeded=exceeded))
-    if not stated:
-        notes.append(words.controller_assumed())
+    notes += _describe_comparison(repetition, test, judgement, stated=stated)
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
@@ -264,6 +260,20 @@ def validate_calibration(
             () if joint is None else assessment_of(joint).backlash,
         ),
     )
+
+
+def _describe_comparison(
+    repetition: Repetition, test: DeviationTest, judgement: Judgement, *, stated: bool
+) -> list[Finding]:
+    """Findings about repeated residuals, and about active offsets that no session states.
+
+    That residuals of wrong readings repeat means nothing.
+    """
+    exceeded = _is_expected(test.p_value) is False
+    repeated = words.describe_repetition(repetition, exceeded=exceeded)
+    means_nothing = repeated.kind == "residuals repeat" and judgement.verdict != "enter"
+    findings = [] if means_nothing else [repeated]
+    return findings if stated else [*findings, words.controller_assumed()]
 
 
 def _apply_stated(
