@@ -137,7 +137,9 @@ def _choose_changes(
     changes: Sequence[Mapping[str, float]],
     determined: Sequence[bool],
 ) -> Sequence[bool]:
-    """Decide which changes are entered: all if the undetermined ones lower the tool error enough.
+    """Decide which changes are entered: the determined ones, and others that lower the tool error.
+
+    The smallest undetermined changes are omitted that together do not lower it enough.
 
     Args:
         calibration: The calibration.
@@ -145,11 +147,15 @@ def _choose_changes(
         changes: Changes of the controller's correction, each parameter to amount, [SI].
         determined: Whether each change is larger than its expanded uncertainty.
     """
-    undetermined: dict[str, float] = {}
-    for change, is_determined in zip(changes, determined, strict=True):
-        if not is_determined:
-            undetermined |= change
-    return [True] * len(changes) if _changes_tool(calibration, tool, undetermined) else determined
+    entered = [True] * len(changes)
+    omitted: dict[str, float] = {}
+    undetermined = [i for i, is_determined in enumerate(determined) if not is_determined]
+    for i in sorted(undetermined, key=lambda i: max(map(abs, changes[i].values()), default=0.0)):
+        omitted |= changes[i]
+        if _changes_tool(calibration, tool, omitted):
+            break
+        entered[i] = False
+    return entered
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, command_to_restart, place_of
 from orthocal.calibration.assessment_record import Finding
-from orthocal.estimation.weighting import stated_sigma, usual_difference
+from orthocal.estimation.weighting import ROUNDING_ERROR, stated_sigma, usual_difference
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.motion.approach import label_reading
@@ -24,9 +24,6 @@ from orthocal.units import MM
 
 MISTAKE_PROBABILITY = 1e-6
 """Probability by chance below which differences of repeated readings are a mistake."""
-
-ROUNDING_ERROR = 1e-9
-"""Rounding error of a difference of two readings, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

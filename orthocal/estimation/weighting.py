@@ -36,6 +36,9 @@ USUAL_STDS = 4.0
 """Largest usual difference of two readings of one posture, in standard deviations of a difference:
 of about 16,000 correct ones one is larger."""
 
+ROUNDING_ERROR = 1e-9
+"""Rounding error of a difference of two readings, [m]."""
+
 USUAL_STEPS = 3
 """The same in steps of a gauge whose noise is not stated."""
 

@@ -21,6 +21,7 @@ from orthocal import (
 )
 from orthocal.assessment.assess import assess
 from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment import controller_entries
 from orthocal.assessment.controller_entries import (
     backlash_changes,
     compute_backlash,
@@ -99,7 +100,7 @@ def test_every_output_has_the_same_decision(calibration, plan):
 
 def test_a_compensation_table_has_the_same_decision(plan):
     both = plan.with_effects(["backlash", "screw"])
-    truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
+    truth = {**TRUTH, "x_slide.screw_sin": 50e-6, "z_slide.screw_sin": 20e-6}
     session = simulate_session(both, truth, seed=3, sigma=NOISE).session
     calibration = calibrate(session, "full", **UNJUDGED)
     found = by_drive(calibration)
@@ -240,3 +241,20 @@ def test_backlash_alone_is_entered_where_the_offsets_stay(plan):
     options = ExportOptions(module=False, latched=(1, 1, 1))
     lines = export_calibration(found, "linuxcnc", anyway=True, options=options)["joints.ini"]
     assert lines.count("BACKLASH = ") == 2
+
+
+def test_small_undetermined_changes_are_omitted(calibration, monkeypatch):
+    """A backlash of 1 µm is not entered because another one that is not determined matters."""
+    least = 10e-6
+    monkeypatch.setattr(
+        controller_entries, "_changes_tool", lambda c, tool, changes: sum(changes.values()) > least
+    )
+    sizes = (1e-6, 30e-6, 8e-6, 4e-6)
+    changes = [{f"{i}.backlash": size} for i, size in enumerate(sizes)]
+    determined = [False, True, False, False]
+    entered = controller_entries._choose_changes(calibration, None, changes, determined)
+    assert entered == [False, True, True, False]
+    assert controller_entries._choose_changes(calibration, None, changes[:2], determined[:2]) == [
+        False,
+        True,
+    ]

@@ -58,7 +58,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     if anomaly.alternatives:
         return _ambiguous(session, result, anomaly)
     first = session.readings[e.rows[0]]
-    descriptions = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
+    descriptions = list(dict.fromkeys(_text(session, c) for c in anomaly.causes or (e,)))
     numbers = _numbers(result, anomaly)
     text = _looks_as_if(session, anomaly, descriptions)
     if e.amounts:
@@ -171,8 +171,8 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
         f"{which} not fit one machine. {what} "
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
         "readings are wrong.",
-        "Calibrate the session that was measured last alone: the values to enter must belong to "
-        "the present machine."
+        "Read a setup of the session that was measured last again. If its readings repeat, the "
+        "machine has changed: calibrate that session alone. Otherwise measure again."
         if session.joined
         else "Measure again.",
         before_rms_um=result.rms_before / UM,

@@ -227,7 +227,7 @@ def earlier_readings() -> Finding:
         "earlier readings",
         "The controller had offsets in this session. If they come from earlier readings of this "
         "machine, this answer does not use these readings, and may differ from that of all.",
-        "Calibrate both sessions together: that answer counts.",
+        "Calibrate both sessions together: that answer counts, unless the machine has changed.",
     )
 
 

@@ -13,9 +13,9 @@ CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
 INCONCLUSIVE = "The validation is inconclusive."
 
-RECALIBRATE = "calibrate from this session and enter its offsets."
+RECALIBRATE = "the machine has changed: calibrate this session alone."
 
-RECALIBRATE_PRINTER = "calibrate from this log and export its settings."
+RECALIBRATE_PRINTER = "the printer has changed: calibrate this log alone and export its settings."
 
 CALIBRATE_JOINTLY = "Calibrate the sessions together and enter these offsets."
 
@@ -68,7 +68,7 @@ def larger_than_predicted(
             cause = "the readings scatter more than before, or something moved during the session"
             action = f"Check the mounting of the {'probe' if firmware else 'gauge'}, then "
             action += "probe again." if firmware else "read again."
-        text += f" After a new fit {mm(refit)} mm RMS remain. Possible: {cause}."
+        text += f" A fit of the new readings alone leaves {mm(refit)} mm RMS. Possible: {cause}."
     return review("larger than predicted", text, action, (place,), **numbers)
 
 
@@ -83,8 +83,10 @@ def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) ->
 
 
 def _with_limit(achieved: float, limit: float) -> str:
-    """RMS of the deviations and its limit, with one more decimal if they are nearly equal."""
-    decimals = 3 if mm(achieved) != mm(limit) else 4
+    """RMS of the deviations and its limit, with more decimals if they are nearly equal."""
+    decimals = next(
+        n for n in (3, 4, 5, 6) if n == 6 or plain(achieved / MM, n) != plain(limit / MM, n)
+    )
     rms, largest = (plain(v / MM, decimals) for v in (achieved, limit))
     return f"{rms} mm RMS (limit {largest} mm)"
 

@@ -9,6 +9,7 @@ neighbours only. A family of more than MAX_PAIRS pairs is not considered.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
 from typing import NamedTuple
@@ -16,8 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from orthocal.arrays import Array, Indices
+from orthocal.estimation.weighting import ROUNDING_ERROR, usual_difference
 from orthocal.hypotheses.anomaly import Explanation, Scope
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, group_rows, sparse_rows
+from orthocal.session.session import Gauge
 
 MAX_ROWS_FOR_ALL_PAIRS = 400
 """Most rows of a session in which all pairs of rows of a setup are considered."""
@@ -223,12 +226,14 @@ def _row_offsets(
             begin.
     """
     offsets = [
-        _offsets(i, rows.values[i], begins, missing=missing)
+        _offsets(i, rows.values[i], begins, _largest_repeat(rows.gauge(i[0])), missing=missing)
         for i, begins in segments
         if i.size >= MIN_ROWS and begins
         for missing in (True, False)
     ]
     if not offsets:
+        return
+    if not any(o.position.size for o in offsets):
         return
     sizes = [o.position.size for o in offsets]
     group = np.repeat(np.arange(len(offsets)), sizes)
@@ -256,19 +261,29 @@ def _row_offsets(
     yield Family(explain, count, count, edits, effects)
 
 
-def _offsets(indices: Indices, values: Array, begins: int, *, missing: bool) -> _Offsets:
+def _largest_repeat(gauge: Gauge) -> float:
+    """Largest difference of two readings of one posture, [m]; infinite if unknown."""
+    usual = usual_difference(gauge)
+    return usual + ROUNDING_ERROR if usual else math.inf
+
+
+def _offsets(
+    indices: Indices, values: Array, begins: int, repeat: float, *, missing: bool
+) -> _Offsets:
     """Row offsets of one kind in some rows, one per row in which it may begin.
 
     Args:
         indices: The rows, shape (m,).
         values: Their readings, shape (m,), [m].
         begins: Number of first rows that may be skipped, or written twice.
+        repeat: Largest difference of a reading that was written twice, [m].
         missing: Whether a reading was skipped, not written twice.
     """
     k = np.arange(begins) if missing else np.arange(1, min(begins + 1, indices.size - 1))
     if missing:  # rows after k get the reading of the row before, row k gets the last one
         base = np.append(0.0, values[:-1] - values[1:])
         return _Offsets(indices, base, k, k + 1, indices[k], values[-1] - values[k], indices[k])
+    k = k[np.abs(values[k] - values[k - 1]) <= repeat]
     # rows from k on get the reading of the row after, the last one is lost
     base = np.append(values[1:] - values[:-1], 0.0)
     return _Offsets(indices, base, k, k, indices[k], np.zeros(k.size), np.full(k.size, indices[-1]))
