@@ -19,9 +19,9 @@ from orthocal import (
     simulate_session,
     validate_calibration,
 )
+from orthocal.assessment import controller_entries
 from orthocal.assessment.assess import assess
 from orthocal.assessment.calibrated_tool import find_tool
-from orthocal.assessment import controller_entries
 from orthocal.assessment.controller_entries import (
     backlash_changes,
     compute_backlash,
@@ -99,9 +99,11 @@ def test_every_output_has_the_same_decision(calibration, plan):
 
 
 def test_a_compensation_table_has_the_same_decision(plan):
+    noise = 1.5e-6  # determines the screws, too
     both = plan.with_effects(["backlash", "screw"])
-    truth = {**TRUTH, "x_slide.screw_sin": 50e-6, "z_slide.screw_sin": 20e-6}
-    session = simulate_session(both, truth, seed=3, sigma=NOISE).session
+    both = both.with_gauge(replace(both.gauge, sigma=noise, resolution=None))
+    truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
+    session = simulate_session(both, truth, seed=3, sigma=noise).session
     calibration = calibrate(session, "full", **UNJUDGED)
     found = by_drive(calibration)
     assert found["x"].enter > 0.0
