@@ -36,11 +36,11 @@ USUAL_STDS = 4.0
 """Largest usual difference of two readings of one posture, in standard deviations of a difference:
 of about 16,000 correct ones one is larger."""
 
-ROUNDING_ERROR = 1e-9
-"""Rounding error of a difference of two readings, [m]."""
-
 USUAL_STEPS = 3
 """The same in steps of a gauge whose noise is not stated."""
+
+ROUNDING_ERROR = 1e-9
+"""Rounding error of a difference of two readings, [m]."""
 
 SMALLEST_SIGMA = 1e-9
 """Smallest standard deviation of a reading, [m]; below it readings count as perfect."""

@@ -62,7 +62,7 @@ def larger_than_predicted(
             cause = f"a reading is wrong, {where} than stated, or the machine has changed"
             repeat = f"Read setup {place.setup} again, which agrees least with the others"
             repeat = "Probe again" if firmware else f"{repeat}: {command}" if command else repeat
-            action = f"{repeat}. Then validate again. If nothing changes, "
+            action = f"{repeat}. Then validate again. If the deviations remain, "
             action += RECALIBRATE_PRINTER if firmware else RECALIBRATE
         else:
             cause = "the readings scatter more than before, or something moved during the session"
