@@ -22,13 +22,14 @@ calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED)
-	$(MAKE) --jobs 3 --output-sync check benchmarks suite
+	@# two processes at first: a benchmark compares times
+	$(MAKE) --jobs 2 --output-sync check benchmarks
+	$(MAKE) suite
 
 suite: $(TESTED)
 	@# compiles the tests for all workers
 	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
-	@# the plus sign: what the tests print is not kept back until they have ended
-	+$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
+	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
 	  --ignore tests/benchmarks
 
 benchmarks: $(TESTED)  # in one process: they compare seconds of the processor
