@@ -64,7 +64,7 @@ class PlanOptions:
         across_mm (MM): Displacement across that direction, to either side.
         minutes_per_setup (MINUTES): Duration of a setup.
         minutes_per_reading (MINUTES): Duration of a reading.
-        criterion (aligned|relative|absolute|worst|A|D|E): For research: figure to minimise.
+        criterion (aligned|relative|absolute|worst|A|D): For research: figure to minimise.
             RMS tool error after aligning the workpiece, after shifting it, or absolute; worst tool
             error; or trace, determinant or largest eigenvalue of the covariance.
         starts (N): For research: number of starts of the search; default: 20000 divided by the

@@ -41,12 +41,12 @@ from orthocal.statistics.information import VAGUE, Information
 from orthocal.statistics.noise import estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
 
-Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
+Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D"]
 """Criterion of a plan. `aligned`, `relative`, `absolute`: RMS tool error. `worst`: error at the
-worst point with translation and rotation removed. A, D, E: trace, determinant or largest eigenvalue
-of the covariance of the parameters, in prior std."""
+worst point with translation and rotation removed. A, D: trace or determinant of the covariance of
+the parameters, in prior std."""
 
-CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
+CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D")
 
 WORST_POWER = 8.0
 """Exponent of the power mean that approximates the largest variance of the points."""
@@ -355,7 +355,7 @@ class CriterionWeight:
 
     def __init__(self, criterion: Criterion, field: Array, weights: Array, n: int) -> None:
         self._criterion, self._field, self._weights, self._n = criterion, field, weights, n
-        self._constant = None if criterion in ("worst", "D", "E") else self._mean_square()
+        self._constant = None if criterion in ("worst", "D") else self._mean_square()
 
     def __call__(self, covariance: Array) -> Array:
         """R for a covariance of the state, shape (n_state, p)."""
@@ -363,12 +363,8 @@ class CriterionWeight:
             return self._constant
         if self._criterion == "worst":
             return self._worst(covariance)
-        n, size = self._n, len(covariance)
-        root = np.zeros((size, n if self._criterion == "D" else 1))
-        if self._criterion == "E":
-            values, vectors = np.linalg.eigh(covariance[:n, :n])
-            root[:n, 0] = vectors[:, -1] if values.size else 0.0
-            return root
+        n = self._n
+        root = np.zeros((len(covariance), n))
         # derivative of det(C)^(1/n) with respect to C: det(C)^(1/n) C⁻¹ / n
         values, vectors = np.linalg.eigh(covariance[:n, :n])
         values = np.maximum(values, 1e-300)

@@ -246,7 +246,7 @@ def searches(orthoglide, headline):
 def test_a_plan_is_best_by_its_criterion(searches, criterion):
     """The other plan minimises the RMS tool error after alignment."""
     (own, of_own), (other, of_other) = searches[criterion], searches["aligned"]
-    assert own.error_of(of_own) < own.error_of(of_other)
+    assert own.error_of(of_own) < 0.9995 * own.error_of(of_other)
     assert other.error_of(of_other) < 0.995 * other.error_of(of_own)
 
 

@@ -54,7 +54,6 @@ FORMS: dict[Criterion, str] = {
     "worst": "tool error at the worst point, workpiece aligned on the machine",
     "A": "mean variance of the errors, in prior standard deviations",
     "D": "determinant of the covariance of the errors, in prior standard deviations",
-    "E": "largest variance of a combination of errors, in prior standard deviations",
 }
 """Criteria in words."""
 
@@ -376,7 +375,7 @@ def show_duration(minutes: float) -> str:
 
 def _unit(plan: MeasuringPlan) -> float:
     """Unit of the criterion of a plan: a micrometre, or 1."""
-    return 1.0 if plan.criterion in ("A", "D", "E") else UM
+    return 1.0 if plan.criterion in ("A", "D") else UM
 
 
 def _counts(plan: MeasuringPlan) -> tuple[int, int]:
