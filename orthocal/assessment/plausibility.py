@@ -16,7 +16,7 @@ from orthocal.errors import OrthocalError
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
-from orthocal.hypotheses.families.unit_and_sign import decimal_step
+from orthocal.hypotheses.families.unit_and_sign import decimal_steps
 from orthocal.measurement.joining import split_sessions
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
@@ -138,7 +138,7 @@ def _fit_inches(values: Array, step: float) -> bool:
     """
     values = values[values != 0.0]
     to_inches = INCH / MM
-    half_width = 0.5 * to_inches * decimal_step(values) / step + STEP_TOLERANCE
+    half_width = 0.5 * to_inches * decimal_steps(values).min() / step + STEP_TOLERANCE
     steps = to_inches * values / step
     by_chance = (2.0 * half_width) ** len(values)
     fit = np.abs(steps - np.round(steps)) <= half_width

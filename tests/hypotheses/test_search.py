@@ -107,6 +107,16 @@ def test_a_reversed_reading_is_named_with_its_line_and_expected_value(cycles, re
     assert n["after_rms_um"] < 0.2 * n["before_rms_um"]
 
 
+def test_a_factor_is_named_only_if_the_dial_can_show_the_corrected_readings(cycles):
+    (found,) = anomalies(cycles.with_values(100.0 * cycles.values))  # divisions, of 0.01 mm
+    assert found.kind == "decimal point"
+    assert "by 0.01" in found.action
+    # a hundredth of these would have been read to a hundredth of a division
+    random = np.random.default_rng(3).uniform(-2e-3, 2e-3, len(cycles.values))
+    found = anomalies(cycles.with_values(np.round(random, 5)))
+    assert "inconsistent readings" in {f.kind for f in found}
+
+
 def test_a_calibration_names_an_outlier_once(cycles):
     values = cycles.values.copy()
     values[4] += 0.23e-3

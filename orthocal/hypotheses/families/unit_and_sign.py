@@ -26,6 +26,9 @@ MIN_RELATIVE_STEP = 1e-3
 """Smallest plausible step of the corrected numbers, relative to the noise. Nobody reads a dial more
 finely; such numbers were computed."""
 
+READ_FRACTION = 0.1
+"""Smallest part of a gauge's division that is read."""
+
 MAX_DECIMALS = 9
 """Largest number of decimals, in mm, of a step."""
 
@@ -65,11 +68,15 @@ def factor_family(
 ) -> Family:
     """Family of hypotheses that correct their rows by a factor.
 
+    Decimal points are omitted if the gauge cannot have shown the corrected numbers.
+
     Args:
         rows: The rows.
         explanations: The explanations, with factors.
         size: Number of possible mistakes of this kind; the number of explanations by default.
     """
+    size = len(explanations) if size is None else size
+    explanations = _without_unreadable(rows, explanations)
     factors = np.array([e.factor for e in explanations], dtype=np.float64)
     changes = [
         (f - 1.0) * rows.values[list(e.rows)] for f, e in zip(factors, explanations, strict=True)
@@ -78,6 +85,23 @@ def factor_family(
     dimensions = np.array([_dimensions(rows, e) for e in explanations])
     volume = dimensions * np.log(np.abs(factors))
     return Family.edited(rows, explanations, changes, size=size, log_volume=volume)
+
+
+def _without_unreadable(rows: Rows, explanations: Sequence[Explanation]) -> list[Explanation]:
+    """Explanations without those decimal points whose corrected numbers no gauge shows.
+
+    If the session has finer numbers than a gauge shows, they are means, and all may be as fine.
+    """
+    steps = decimal_steps(rows.values)
+    divisions = np.array([rows.gauge(i).resolution or 0.0 for i in range(rows.count)])
+    least = np.minimum(READ_FRACTION * divisions, steps[rows.written].min(initial=np.inf))
+    readable = (1.0 - STEP_TOLERANCE) * least
+
+    def can_be_read(explanation: Explanation) -> bool:
+        concerned, factor = list(explanation.rows), explanation.factor or 1.0
+        return bool((factor * steps[concerned].min() >= readable[concerned]).all())
+
+    return [e for e in explanations if e.kind != "decimal point" or can_be_read(e)]
 
 
 def _reversed(
@@ -117,7 +141,8 @@ def _scaled(
     sigma: float,
 ) -> Family:
     """Family of groups multiplied by each factor after which the decimal step is plausible."""
-    steps = [decimal_step(rows.values[list(g.rows)]) for g in groups]
+    of_rows = decimal_steps(rows.values)
+    steps = [of_rows[list(g.rows)].min() for g in groups]
     explanations = [
         replace(g, kind=kind, factor=factor)
         for factor in factors
@@ -135,10 +160,10 @@ def _dimensions(rows: Rows, group: Explanation) -> int:
     return len(group.rows) - len({readings[i].setup for i in group.rows if rows.single[i]})
 
 
-def decimal_step(values: Array) -> float:
-    """Largest decimal step (1 mm, 0.1 mm, …) that divides all values, [m]; 0 if there is none."""
-    for decimals in range(MAX_DECIMALS):
+def decimal_steps(values: Array) -> Array:
+    """Largest decimal step (1 mm, 0.1 mm, …) that divides each value, [m]; 0 if there is none."""
+    result = np.zeros(len(values))
+    for decimals in reversed(range(MAX_DECIMALS)):
         step = 10.0**-decimals * MM
-        if np.abs(values / step - np.round(values / step)).max() < STEP_TOLERANCE:
-            return step
-    return 0.0
+        result[np.abs(values / step - np.round(values / step)) < STEP_TOLERANCE] = step
+    return result
