@@ -705,7 +705,11 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     if file is None or rows[0].line is None:
         return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
-    others = "" if len(rows) == 1 else ", likewise the other lines"
+    others = ""
+    if further := {r.line or 0 for r in rows} - {line}:
+        one_file = len({r.file for r in rows}) == 1
+        named = spans(sorted(further), "line") if one_file else "the other lines"
+        others = f", likewise {named}"
     correct = f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
     if not all(_has_present_offsets(session, r) for r in rows):
         return (
