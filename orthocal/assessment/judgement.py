@@ -108,7 +108,9 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     Raises:
         ClosureError: If the machine cannot reach a posture.
         RobotError: If the closures of the robot depend on each other.
+        SessionError: If the session cannot be calibrated; see `Session.require_complete`.
     """
+    session.require_complete()
     mistakes = _find_mistakes(session, anomalies)
     implausible = find_implausible(session, explained=bool(mistakes))
     if any(f.kind == "wrong dimensions" for f in implausible):

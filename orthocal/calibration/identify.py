@@ -73,6 +73,7 @@ def identify(
     if isinstance(choice, Choice):
         gathered = [choice.applied_to(one) for one in gathered]
     session = join_sessions(gathered)
+    session.require_complete()
     require_names(profile, argument="profile")
     chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)
@@ -85,11 +86,10 @@ def identify(
     if scale.factor != 1.0:
         selection = chosen.select(session.robot.parameters, tolerance_scale=scale)
         problem = CalibrationProblem(session, selection)
-    full_problem = problem if chosen.base else None
     solve = _fit_base if chosen.base else fit_problem
     fit = solve(problem, options=options, start=start_values)
     profiled = _match_profiled(fit.problem, profile)
-    calibration = assemble_calibration(fit, full_problem=full_problem)
+    calibration = assemble_calibration(fit, full_problem=problem if chosen.base else None)
     return _with_intervals(calibration, fit, profiled), session
 
 

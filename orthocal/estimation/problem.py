@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Mask
-from orthocal.errors import ClosureError, RobotError
+from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.estimation.mirrored_starts import (
     MirroredDirections,
     find_mirrored_directions,
@@ -387,7 +387,13 @@ class CalibrationProblem:
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
+            ParameterError: If the units are unknown, or theta has another size.
         """
+        size = np.atleast_1d(theta).shape[-1]
+        if size not in (self.n_free, self.n_machine):
+            raise ParameterError(f"has {size} numbers; expected {self.n_free}", where="theta")
+        if units not in ("prior_std", "SI"):
+            raise ParameterError(f"found {units!r}; expected 'prior_std' or 'SI'", where="units")
         q = self.close(theta) if passive is None else passive
         linear = self.linearise(theta, q)
         jacobian = linear.jacobian

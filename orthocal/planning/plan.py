@@ -36,6 +36,7 @@ from orthocal.planning.cost_curve import (
 )
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import (
+    CRITERIA,
     Criterion,
     Expected,
     ToolForecast,
@@ -193,10 +194,15 @@ def plan_readings(
         report: Called with a line of text as the work proceeds.
 
     Raises:
-        ParameterError: If numbers contradict each other, or there are no candidate readings.
+        ParameterError: If numbers contradict each other, the criterion is unknown, or there are no
+            candidate readings.
         RobotError: If the drives do not command the tool.
         SessionError: If the repeatability of the existing readings is unknown.
     """
+    if criterion not in CRITERIA:
+        raise ParameterError(
+            f"found '{criterion}'; expected one of {', '.join(CRITERIA)}", where="criterion"
+        )
     work = _SearchOptions(criterion, seed, starts, workers, report or (lambda text: None))
     measured = None if measured is None else state_noise(measured)
     chosen = resolve_choice(choice, measured, default_model=MODEL)

@@ -132,6 +132,11 @@ class Section:
     value: float
     """World coordinate [m], distance from the root at the mechanical zero [m], or fraction [1]."""
 
+    def __post_init__(self) -> None:
+        if self.form not in get_args(SectionForm):
+            expected = ", ".join(get_args(SectionForm))
+            raise ValueError(f"form: found {self.form!r}; expected one of {expected}")
+
     @staticmethod
     def from_keys(keys: SectionKeys) -> Section:
         """Build from the keys of a session.yaml."""

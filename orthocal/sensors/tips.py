@@ -113,6 +113,10 @@ class Tip:
     width: float = 0.0
     """Width of a blade, [m]."""
 
+    def __post_init__(self) -> None:
+        if self.form not in ("ball", "blade"):
+            raise ValueError(f"form: found {self.form!r}; expected 'ball' or 'blade'")
+
     @staticmethod
     def from_keys(keys: TipKeys) -> Tip:
         """Build from the keys of a session.yaml."""

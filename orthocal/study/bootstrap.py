@@ -178,7 +178,7 @@ class Scatter:
     """Upper end of the interval that contains 95 % of the draws, [SI]."""
     predicted: float
     """Standard deviation from noise, from the covariance, [SI]."""
-    total_std: float
+    model_std: float
     """Standard deviation that includes the prior, from the covariance, [SI]."""
 
 
@@ -222,7 +222,7 @@ def summarise_bootstrap(study: BootstrapStudy, table: StudyTable) -> BootstrapSu
                 low=float(low),
                 high=float(high),
                 predicted=float(noise[i]),
-                total_std=float(total[i]),
+                model_std=float(total[i]),
             )
         )
     return BootstrapSummary(len(table), fit.sigma, tuple(rows), cycles)

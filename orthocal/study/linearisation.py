@@ -287,7 +287,7 @@ def build_linearisation_study(
             without the paper's equations.
         free: Names or globs of the errors that increase and are identified.
         largest: Largest size of a machine, [mm or mrad]: its largest error component.
-        count: Number of sizes, a geometric sequence from 0.1 mm.
+        count: Number of sizes, a geometric sequence from 0.1 mm; the largest alone with 1.
         directions: Number of random directions of the errors.
         along: One direction in place of random ones: a number for each error.
         sizes: Sizes in place of `largest` and `count`, [mm or mrad].
@@ -317,7 +317,7 @@ def build_linearisation_study(
     # the size of (1, −0.6, 0.3) is its largest component
     unit_vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
     if sizes is None:
-        sizes = np.geomspace(min(SMALLEST_SIZE, largest), largest, count).tolist()
+        sizes = np.geomspace(largest, min(SMALLEST_SIZE, largest), count)[::-1].tolist()
     return LinearisationStudy(
         session=_idealise(source),
         free=tuple(names),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibrated import session_of
@@ -9,8 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tolerances import CLOSED_FORM, KINEMATICS
 
-from orthocal import load_plan, load_session, write_session
-from orthocal.errors import SessionError
+from orthocal import (
+    Gauge,
+    Reading,
+    Section,
+    Tip,
+    calibrate,
+    check_session,
+    load_plan,
+    load_session,
+    plan_readings,
+    write_session,
+)
+from orthocal.errors import ParameterError, SessionError
+from orthocal.estimation.problem import build_problem
 from orthocal.session.session import split_label
 
 HEAD = """robot: orthoglide
@@ -167,3 +181,59 @@ def test_a_session_written_elsewhere_has_its_robot(root, tmp_path):
 )
 def test_names_of_joined_sessions_have_a_label(name, joined, parts):
     assert split_label(name, joined=joined) == parts
+
+
+def with_sensor(session, **changes):
+    """The session with another sensor in its first setup."""
+    name, setup = next(iter(session.setups.items()))
+    changed = replace(setup, sensor=replace(setup.sensor, **changes))
+    return replace(session, setups={**session.setups, name: changed})
+
+
+SPOILT_IN_PYTHON = [
+    (lambda s: s.select([Reading("nowhere", "zero", value=1e-3)]), "'nowhere' is not a setup"),
+    (lambda s: s.select([Reading("yx", "nowhere", value=1e-3)]), "'nowhere' is not a posture"),
+    (lambda s: s.select([Reading("yx", "zero", "up", value=1e-3)]), "'up' is not a posture"),
+    (lambda s: with_sensor(s, leg="w"), "'w' is not a leg of orthoglide"),
+    (lambda s: with_sensor(s, direction="q"), "setups.yx.direction: found 'q'"),
+    (lambda s: with_sensor(s, section=Section("fraction", 1.5)), "found 1.5; expected 0"),
+    (lambda s: replace(s, readings=(Reading("yx", "zero"),)), "no reading has a value"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILT_IN_PYTHON)
+@pytest.mark.parametrize("use", [calibrate, check_session])
+def test_a_session_that_was_made_in_python_is_checked(raw_cycles, use, spoil, message):
+    with pytest.raises(SessionError, match=message):
+        use(spoil(raw_cycles))
+
+
+def test_a_plan_is_not_calibrated(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    with pytest.raises(SessionError, match="no reading has a value"):
+        calibrate(plan, "offsets")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Section("frac", 0.5), "expected one of coordinate_mm, from_root_mm, fraction"),
+        (lambda: Tip("bal", 2e-3), "expected 'ball' or 'blade'"),
+        (lambda: Gauge(sigma=0.0), "sigma: found 0.0; expected a positive number"),
+        (lambda: Gauge(sigma=-1e-5), "sigma: found -1e-05"),
+        (lambda: Gauge(resolution=float("nan")), "resolution: found nan"),
+    ],
+)
+def test_impossible_parts_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_unknown_arguments_are_refused(raw_cycles):
+    problem = build_problem(raw_cycles, model="offsets")
+    with pytest.raises(ParameterError, match="expected 'prior_std' or 'SI'"):
+        problem.predict_and_jacobian(problem.active_theta, units="mm")
+    with pytest.raises(ParameterError, match=f"has 2 numbers; expected {problem.n_free}"):
+        problem.predict_and_jacobian(np.zeros(2))
+    with pytest.raises(ParameterError, match="criterion: found 'zzz'; expected one of aligned"):
+        plan_readings(raw_cycles.robot, criterion="zzz")

@@ -57,11 +57,11 @@ def test_rescaled_residuals_have_the_size_of_the_noise(many_cycles):
     assert abs(prepared.residuals.mean()) < 1e-18
 
 
-def test_total_std_includes_the_prior(root):
+def test_model_std_includes_the_prior(root):
     session = load_session(root / "examples/sweep")
     study = build_bootstrap_study(session, "lengths", draws=60)
     found = summarise_bootstrap(study, run_study(study))
-    assert all(p.predicted < p.total_std for p in found.parameters)
+    assert all(p.predicted < p.model_std for p in found.parameters)
 
 
 def test_session_without_residuals_or_cycles(root):

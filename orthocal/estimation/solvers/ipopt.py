@@ -201,7 +201,8 @@ class NonlinearProgram(Program):
         first = self._n_theta + self._n_zeros
         passive = slice(first, first + problem.n_states * self._n_passive)
         return Solution(
-            theta=x[: self._n_theta] * problem.theta_scale,
+            theta=np.clip(x[: self._n_theta], lower[: self._n_theta], upper[: self._n_theta])
+            * problem.theta_scale,
             zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
             passive=x[passive].reshape(-1, self._n_passive) * problem.passive_scale,
             objective=float(result["f"]) / _weighting(sigma)[1],

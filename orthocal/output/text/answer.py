@@ -14,6 +14,7 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import expanded_uncertainty, lowers
+from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -47,6 +48,9 @@ from orthocal.output.text.layout import (
 from orthocal.session.session import split_label
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS
+
+NONE_SHOWN = "none shown"
+"""Backlash that is not larger than its uncertainty, in words."""
 
 MOST_LISTED = 4
 """Further findings that the short answer lists."""
@@ -424,20 +428,27 @@ def render_values(calibration: Calibration) -> RenderableType:
 
 
 def render_backlash(calibration: Calibration) -> RenderableType:
-    """Backlash for the controller to take up, drive by drive; a line if there is none to enter."""
+    """Backlash for the controller to take up, drive by drive; a line if there is none to enter.
+
+    "None shown" is a backlash that is not larger than its uncertainty, "not determined" one that
+    readings do not limit.
+    """
     entries = assessment_of(calibration).backlash
-    rows, halves, known = [], [], False
+    rows, halves, known, small = [], [], False, True
     for e in entries:
         factor, uncertainty = e.edge_factor, expanded_uncertainty(calibration, e)
         half = plain(uncertainty * factor)
         is_known = e.active > 0.0 or e.identified > uncertainty
         known |= is_known or bool(e.change)
-        unchanged = "stays" if is_known else "not determined"
+        error = calibration[f"{e.drive}.backlash"]
+        limited = error.std < DETERMINED * error.prior_std
+        unchanged = "stays" if is_known else NONE_SHOWN if limited else "not determined"
+        small &= limited
         enter = plain(e.enter * factor) if e.change else unchanged
         rows.append((e.drive, plain(e.active * factor), enter, half, e.edge_unit))
         halves.append(f"±{half} {e.edge_unit}")
     if not known:
-        return Text(f"Backlash: not determined ({max(halves)}).")
+        return Text(f"Backlash: {NONE_SHOWN if small else 'not determined'} ({max(halves)}).")
     return table_of(("backlash", "now", "new", "±", "unit"), rows)
 
 

@@ -51,7 +51,7 @@ FORMS: dict[Criterion, str] = {
     "aligned": "RMS tool error, workpiece aligned on the machine",
     "relative": "RMS tool error, translation removed",
     "absolute": "RMS tool error, absolute",
-    "worst": "tool error at the worst point, workpiece aligned on the machine",
+    "worst": "tool error that weighs the worst points most, workpiece aligned on the machine",
     "A": "mean variance of the errors, in prior standard deviations",
     "D": "determinant of the covariance of the errors, in prior standard deviations",
 }
@@ -109,6 +109,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     helps = _helps(plan, gains)
     names = [*_unusable_names(plan), *plan.unchosen]
     absent = f", without {joined(names)}" if names else ""
+    after = _second_measurement(plan, ", tool error after ")
     parts: list[RenderableType] = [
         Text(
             f"Plan for {robot.name}, model {plan.forecast.selection.label}: {describe_size(s)}, "
@@ -119,8 +120,8 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         *map(Text, describe_expected(plan)),
         *map(Text, _undetermined(plan, gains)),
         Text(_when_enough(plan)),
-        section("Other plans in the same time", _alternatives(plan)),
-        *([section("What would help", bullets(helps))] if helps else []),
+        section(f"Other plans in the same time{after}", _alternatives(plan)),
+        *([section(f"What would help{after}", bullets(helps))] if helps else []),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(_how_to_measure(plan))),
@@ -364,7 +365,12 @@ def draw_plan(plan: MeasuringPlan) -> str:
 
 def show_um(expected: Expected) -> str:
     """Expected tool error, [µm]."""
-    value = expected.reported.rms / UM
+    return _in_um(expected.reported.rms)
+
+
+def _in_um(error: float) -> str:
+    """A tool error, [m], in µm."""
+    value = error / UM
     return plain(value, 0 if value >= 20.0 else 1)
 
 
@@ -389,19 +395,28 @@ def _when_enough(plan: MeasuringPlan) -> str:
     """Number of setups beyond which another hour gains little, in a sentence."""
     if _unit(plan) != UM:
         return f"Criterion: {FORMS[plan.criterion]}."
+    other = "" if plan.criterion == "aligned" else f" This is the {FORMS[plan.criterion]}."
     enough = plan.enough
     if enough is None:
         last = plan.curve[-1]
         return (
-            f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {tool_mm(last.error)} "
-            f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)})."
+            f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {_in_um(last.error)} µm "
+            f"instead of {_in_um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
+            f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)}).{other}"
         )
     if plan.stage.minutes <= enough.minutes and plan.stage.error <= enough.error:
         return f"Further setups gain less than {HOURLY_GAIN:.0%} an hour."
     return (
         f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
-        f"{tool_mm(enough.error)}. More setups gain less than {HOURLY_GAIN:.0%} an hour."
+        f"{_in_um(enough.error)} µm instead of {_in_um(plan.stage.error)} µm"
+        f"{_second_measurement(plan, ' after ')}. "
+        f"More setups gain less than {HOURLY_GAIN:.0%} an hour.{other}"
     )
+
+
+def _second_measurement(plan: MeasuringPlan, prefix: str) -> str:
+    """Measurement after which tool errors of a first plan are stated; "" for a complement."""
+    return "" if plan.complements else f"{prefix}a second measurement"
 
 
 def _alternatives(plan: MeasuringPlan) -> RenderableType:

@@ -230,7 +230,7 @@ def _estimate_table(parameters: Sequence[dict[str, Any]], all_rows: bool) -> Ren
 
 def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
     s = summarise_bootstrap(table.study, table)  # type: ignore[arg-type] # by its kind
-    names = ("estimate", "std", "standard_error", "low", "high", "predicted", "total_std")
+    names = ("estimate", "std", "standard_error", "low", "high", "predicted", "model_std")
     parameters = _parameters(s.parameters, names)
     shown = parameters if all_rows else parameters[:MOST_ROWS]
     rows = [
@@ -239,17 +239,17 @@ def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
             f"{p['estimate']:+.3f}",
             *(_number(p[name]) for name in ("std", "predicted")),
             f"{p['low']:+.3f} … {p['high']:+.3f}",
-            _number(p["total_std"]),
+            _number(p["model_std"]),
             p["unit"],
         )
         for p in shown
     ]
-    header = ("parameter", "estimate", "std", "predicted std", "95 % of draws", "total std", "unit")
+    header = ("parameter", "estimate", "std", "predicted std", "95 % of draws", "model std", "unit")
     omitted = ""
     if len(shown) < len(parameters):
         omitted = f"The first {len(shown)} of {len(parameters)}; --all lists all."
     notes = (
-        "std and predicted std: by noise alone. Total std: with the prior, but without errors "
+        "std and predicted std: by noise alone. Model std: with the prior, but without errors "
         "that are not identified.",
     )
     document = {
