@@ -70,6 +70,7 @@ def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):
     others = {f"{k}_slide.offset_m": (-1e-4, 1e-4) for k in "xz"}
     free = identified(experiment_2, Choice(bounds=others))
     assert [p.at_bound for p in narrow.free] == ["lower", None, "lower"]
+    assert all(p.lower <= p.value <= p.upper for p in narrow.free)
     found, expected = narrow["y_slide.offset"], free["y_slide.offset"]
     assert found.value == pytest.approx(expected.value, abs=1e-8)
     assert found.std == pytest.approx(expected.std, rel=1e-4)

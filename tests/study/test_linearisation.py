@@ -217,3 +217,12 @@ def test_noise_and_resolution_of_the_gauge(orthoglide):
     assert study.resolution == 2e-6
     assert study.sigma == pytest.approx(np.hypot(1e-6, 2e-6 / np.sqrt(12)))
     assert exact(study.session).setups.keys() == study.session.setups.keys()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_last_size_is_the_largest(orthoglide, count):
+    sizes = build_linearisation_study(orthoglide, largest=17.61, count=count).sizes
+    assert sizes == tuple(sorted(sizes))
+    assert len(sizes) == count
+    assert sizes[-1] == 17.61
+    assert count == 1 or sizes[0] == 0.1
