@@ -20,7 +20,7 @@ from orthocal.calibration.records import CalibrationRecord
 from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.io.documents import format_json, read_json, validate, write_plain
 from orthocal.io.fields import finite_or_none
-from orthocal.io.files import exists, is_folder, write_file
+from orthocal.io.files import exists, is_folder, require_suffix, write_file
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
 
@@ -90,10 +90,12 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     """Write a calibration.json.
 
     Raises:
-        OrthocalError: If it cannot be written.
+        OrthocalError: If it cannot be written, or if the name is that of another kind of file.
     """
-    write_file(Path(path), calibration_json(calibration))
-    return Path(path)
+    file = Path(path)
+    require_suffix(file, ".json", OTHER_KINDS)
+    write_file(file, calibration_json(calibration))
+    return file
 
 
 def _require_loadable(document: dict[str, Any], calibration: Calibration) -> None:

@@ -329,9 +329,10 @@ def _refuse_overlap(parameters: ParameterSet, names: Sequence[str]) -> None:
             if term in owners:
                 larger = max(name, owners[term], key=lambda n: len(parameters[n].terms))
                 terms = ", ".join(t for t, _ in parameters[larger].terms)
+                parts = ",".join(f"!{t}" for t, _ in parameters[larger].terms)
                 raise ParameterError(
                     f"'{owners[term]}' and '{name}' are partly the same error: {larger} is the sum "
-                    f"of {terms}; exclude one of them, such as '!{term}'"
+                    f"of {terms}; exclude it, or its parts by '{parts}'"
                 )
             owners[term] = name
 

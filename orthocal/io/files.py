@@ -7,7 +7,7 @@ import os
 import re
 import stat
 from codecs import getincrementaldecoder
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import IncrementalNewlineDecoder
 from itertools import chain
@@ -279,6 +279,23 @@ def _require_replaceable(path: Path) -> None:
 
 Content = str | bytes | Iterable[bytes]
 """Content of a file: text, which is written as UTF-8, bytes, or a sequence of bytes."""
+
+
+def require_suffix(path: Path, suffix: str, others: Sequence[str]) -> None:
+    """Refuse to write a file whose suffix is that of another kind of file, such as readings.
+
+    Args:
+        path: The file.
+        suffix: Suffix that is expected, for the message.
+        others: Suffixes of other kinds of files.
+
+    Raises:
+        OrthocalError: If the suffix is one of them.
+    """
+    if path.suffix.lower() in others:
+        raise OrthocalError(
+            f"is another kind of file; expected a name with {suffix}", where=str(path)
+        )
 
 
 def write_file(path: Path, content: Content) -> None:

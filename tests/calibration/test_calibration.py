@@ -20,11 +20,12 @@ from orthocal import (
     parameter_table,
     simulate_session,
     summarize,
+    write_report,
 )
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, calibration_json, write_calibration
 from orthocal.calibration.identify import identify
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, OrthocalError
 from orthocal.statistics.chance import COVERAGE, confidence_factor
 
 QUICK = {"solver": "variable-projection"}
@@ -265,3 +266,13 @@ def test_coordinates_beyond_the_travel_are_refused():
     machine = calibrated("table1/experiment-2").machine
     with pytest.raises(ClosureError, match="x_slide_mm is 391; the drive reaches from 120 to 390"):
         machine.forward([0.391, 0.31, 0.31])
+
+
+def test_readings_are_not_overwritten_by_results(tmp_path):
+    result = calibrated("raw-cycles", "offsets")
+    readings = tmp_path / "readings.csv"
+    readings.write_text("mine")
+    for write, suffix in ((write_calibration, ".json"), (write_report, ".html")):
+        with pytest.raises(OrthocalError, match=f"expected a name with {suffix}"):
+            write(result, readings)
+    assert readings.read_text() == "mine"

@@ -133,13 +133,14 @@ def describe_repetition(
         title: Title of the other session; "" not to name it.
     """
     r, where = repetition, f" in '{title}'" if title else ""
-    numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.p_value}
+    numbers = {"rows": float(r.matched)}
     if r.repeats is None:
         reason = f"nearly all residuals of the calibration in the {r.matched} shared lines are 0"
         if r.matched < MIN_ROWS:
             reason = "too few lines are shared"
         text = f"It is unknown whether the same deviations remain{where}: {reason}."
         return note("repetition unknown", text, **numbers)
+    numbers |= {"correlation": r.correlation, "chance": r.p_value}
     if r.repeats:
         text = (
             f"The same deviations remain as before{where}: they are errors that this model does "

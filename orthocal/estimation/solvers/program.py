@@ -157,6 +157,8 @@ def scaled_bounds(
 
 def advise(options: SolverOptions) -> str:
     """Advice if a solver does not converge, or converges to an impossible machine."""
-    return "Look for a reading with a wrong sign or in a wrong row" + (
+    stopped_early = options.max_iterations < SolverOptions().max_iterations
+    few = f"Allow more than {options.max_iterations} iterations. " if stopped_early else ""
+    return f"{few}Look for a reading with a wrong sign or in a wrong row" + (
         "" if options.loss.robust else "; the loss 'huber' (option --loss) may show which one"
     )

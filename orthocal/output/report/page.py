@@ -16,7 +16,7 @@ from orthocal.assessment.circular_deviation import find_circles
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
-from orthocal.io.files import write_file
+from orthocal.io.files import require_suffix, write_file
 from orthocal.io.html import escape, heading, items, page, paragraph, table
 from orthocal.output.report.parameter_plots import (
     plot_correlations,
@@ -129,14 +129,21 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
     return page(title, style, f"{header}\n<main>{body}</main>", scripts=True)
 
 
+OTHER_KINDS = (".csv", ".json", ".urdf", ".yaml", ".yml")
+"""Suffixes of files that are no report."""
+
+
 def write_report(calibration: Calibration, path: str | Path) -> Path:
     """Write the report of a calibration.
 
     Raises:
-        OrthocalError: If the report cannot be built or written.
+        OrthocalError: If the report cannot be built or written, or if the name is that of another
+            kind of file.
     """
-    write_file(Path(path), build_report(calibration))
-    return Path(path)
+    file = Path(path)
+    require_suffix(file, ".html", OTHER_KINDS)
+    write_file(file, build_report(calibration))
+    return file
 
 
 def _verdict(calibration: Calibration, saved: Path | None, further: FurtherHour) -> str:

@@ -129,7 +129,7 @@ def _scores(comparison: Comparison) -> RenderableType:
     sizes = ("free", "effective", "RMS [mm]", "χ²", "dof", "AICc", "BIC", "ln evidence")
     return noted(
         table_of(("model", "", *sizes, "CV [mm]", "uncertainty [µm]"), rows, left=2),
-        "–: no redundant reading checks this model",
+        "–: no redundant reading checks this model; for AICc, hardly 3 degrees of freedom or fewer",
         "effective: number of parameters that the readings determine",
         "AICc, BIC: lower is better; ln evidence (0: complete model): higher is better",
         "CV: cross-validation, RMS error of predicting each setup from all others",

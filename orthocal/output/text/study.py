@@ -174,7 +174,7 @@ def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float)
         f"Expected tool error after calibration: {tool_mm(s.after)} RMS (before: "
         f"{tool_mm(s.before)}), over the workspace {describe_box(np.array(study.box))} after "
         "aligning the workpiece.",
-        f"Mean of {counted(s.machines, 'machine')}, standard error {_um(s.standard_error)} µm; "
+        f"RMS over {counted(s.machines, 'machine')}, standard error {_um(s.standard_error)} µm; "
         f"95 % of the machines are below {tool_mm(s.percentile_95)}.",
         "The controller corrects all identified errors.",
     ]

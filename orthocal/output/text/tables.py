@@ -76,7 +76,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         *(["resolved"] if prior else []),
         *(["95 % profile interval"] if profiled else []),
         *(["exact − linear"] if shifts else []),
-        *(["in std"] if in_std else []),
+        *(["in std" if shifts else "exact − linear [std]"] if in_std else []),
         "unit",
     )
     few = all_rows or len(c.free) <= MANY_PARAMETERS
