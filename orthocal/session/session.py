@@ -482,7 +482,7 @@ class Session:
 
         Raises:
             SessionError: If a sensor does not fit the robot, a reading names an unknown setup or
-                posture, or no reading has a value.
+                posture, or no reading of a gauge with a free zero has a value.
         """
         for name, setup in self.setups.items():
             setup.sensor.require_fit(self.robot, where=f"setups.{name}")
@@ -492,7 +492,8 @@ class Session:
             for posture in (r.posture, *([] if r.minus is None else [r.minus])):
                 if posture not in self.postures:
                     _refuse_name(posture, "posture", self.postures)
-        if not self.values.any() and all(r.line is None for r in self.readings):
+        relative = all(setup.zero == "free" for setup in self.setups.values())
+        if relative and not self.values.any() and all(r.line is None for r in self.readings):
             raise SessionError("no reading has a value; expected readings, in m", where="readings")
 
     def with_values(self, values: Sequence[float] | Array) -> Session:

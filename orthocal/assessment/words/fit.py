@@ -45,8 +45,8 @@ def noise_from_residuals(sigma: float) -> Finding:
     """Finding that the noise is known from the residuals only."""
     return note(
         "noise from residuals",
-        "The noise is estimated from the residuals alone, so unmodelled errors are counted as "
-        "noise.",
+        "The noise is estimated from the residuals alone, so unmodelled errors count as noise. "
+        "Whether the machine is within its tolerances is not checked, and ± may be too small.",
         "Repeat readings in cycles, or state gauge.sigma_mm.",
         sigma_mm=sigma / MM,
     )
