@@ -94,7 +94,7 @@ def test_every_output_has_the_same_decision(calibration, plan):
     )
     text = to_text(render_answer(calibration, saved=Path("out")))
     rows = [r.split() for r in text.splitlines() if r.split()[:1] == ["z_slide"]]
-    assert rows[1][2:4] == ["not", "determined"]
+    assert rows[1][2:4] == ["none", "shown"]
     assert "and this backlash" in text
 
 
