@@ -116,14 +116,8 @@ def plan(
     from orthocal.output.text.answer import calibrate_command, quote_path
     from orthocal.output.text.plan import describe_assumed_tip, plan_json
     from orthocal.output.text.summary import print_summary
-    from orthocal.planning.expected_error import CRITERIA
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
-    if options.criterion not in CRITERIA:
-        raise ParameterError(
-            f"found '{options.criterion}'; expected one of {', '.join(CRITERIA)}",
-            where="--criterion",
-        )
     if out is not None:
         require_new_session(out, FILES, force=force)
     workers = options.workers or available_cores()
@@ -178,7 +172,7 @@ def _choose(
         equipment=equipment,
         measured=measured,
         workspace=workspace,
-        criterion=options.criterion,  # type: ignore[arg-type] # checked by `plan`
+        criterion=options.criterion,  # type: ignore[arg-type] # checked by `plan_readings`
         seed=options.seed,
         starts=options.starts,
         reference=subject if measured is None else measured.robot_reference,

@@ -266,7 +266,7 @@ def test_a_plan_has_the_criterion_that_is_stated(orthoglide, headline):
     [
         (["nowhere"], "nowhere: there is no such file or directory"),
         (["orthoglide", "--add", 2], "--add: needs a session; found a robot"),
-        (["orthoglide", "--criterion", "F"], "--criterion: found 'F'; expected one of aligned,"),
+        (["orthoglide", "--criterion", "F"], "criterion: found 'F'; expected one of aligned"),
         (["orthoglide", "--box", "-10"], "--box: found '-10'; expected half the side of a cube"),
         (["orthoglide", "--box", "5:1"], "--box: found '5:1'; expected half the side of a cube"),
         (["orthoglide", "--box", "-5:1,-5:1"], "--box: has 2 ranges; expected one for all, or one"),
