@@ -14,6 +14,13 @@ INSTALLED = $(VENV)/.installed
 TESTED = $(VENV)/.installed-test
 DOCUMENTED = $(VENV)/.installed-docs
 
+PIP = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
+# uv takes a fifth of the time of pip, but does not read pip's settings for proxies and mirrors
+define install
+$(PIP) uv && $(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python --editable '$(1)' || \
+	  $(PIP) --no-compile --editable '$(1)'
+endef
+
 unexport PYTHONDONTWRITEBYTECODE  # processes of tests do not compile what others have compiled
 
 .PHONY: calibrate test suite benchmarks smoke check docs clean
@@ -54,13 +61,13 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED): pyproject.toml | $(VENV)/bin/python
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(call install,.)
 	touch $@
 
 $(TESTED): pyproject.toml | $(VENV)/bin/python
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[test]"
+	$(call install,.[test])
 	touch $@ $(INSTALLED)
 
 $(DOCUMENTED): pyproject.toml | $(VENV)/bin/python
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	$(call install,.[docs])
 	touch $@
