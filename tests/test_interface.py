@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from orthocal import (
+    CalibrationProblem,
     Choice,
     LiveScene,
     SolverOptions,
@@ -21,6 +22,8 @@ from orthocal import (
     load_plan,
     load_robot,
     load_session,
+    parameter_table,
+    reading_table,
     simulate_session,
     summarize,
     validate_calibration,
@@ -220,6 +223,9 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
         (lambda: compare_models(experiment_2, models=5), "models: found 5"),
         (lambda: compare_models(experiment_2, models="full"), "expected a list of names"),
         (lambda: assess_tool(5), "expected a Calibration"),
+        (lambda: parameter_table(5), "expected a Calibration"),
+        (lambda: reading_table(experiment_2), "expected a Calibration"),
+        (lambda: CalibrationProblem(experiment_2, "full"), "expected a Selection"),
         (lambda: simulate_session(5, {}), "expected a Session"),
         (lambda: simulate_session(experiment_2, 5), "errors: found a int; expected a mapping"),
         (lambda: simulate_session(experiment_2, {"x_slide.offset": "a"}), "expected a name and"),

@@ -23,7 +23,6 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import (
@@ -42,7 +41,11 @@ from orthocal.assessment.controller_entries import (
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry, ToolErrorSummary
-from orthocal.calibration.calibration import Calibration, propagate_stds
+from orthocal.calibration.calibration import (
+    Calibration,
+    propagate_stds,
+    require_calibration,
+)
 from orthocal.effects.adjustment import LEVER_SHARE, Adjustment, find_adjustments
 from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -134,7 +137,7 @@ def plan_adjustments(
         ParameterError: If the noise of the readings is unknown.
         ClosureError: If the machine cannot reach its workspace.
     """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     candidates = [
         a for a in find_adjustments(calibration.robot) if among is None or a.name in among
     ]

@@ -38,7 +38,7 @@ from orthocal.calibration.assessment_record import (
     ToolErrorSummary,
     first_of,
 )
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, ExportError, RobotError
@@ -143,7 +143,7 @@ def assess(
     Raises:
         ClosureError: If the machine cannot reach a posture.
     """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     session_used = session or restore_session(calibration)
     if judgement is None:
         judgement = judge_session(session_used)
@@ -187,7 +187,7 @@ def assess(
 
 def assessment_of(calibration: Calibration) -> Assessment:
     """Assessment of a calibration, as recorded; computed if there is none."""
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     return calibration.assessment or assess(calibration)
 
 

@@ -20,7 +20,6 @@ from functools import partial
 
 import numpy as np
 
-from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import (
     CalibratedTool,
@@ -39,7 +38,7 @@ from orthocal.calibration.assessment_record import (
     ToolUse,
     UsePart,
 )
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import (
     UseConditions,
@@ -250,7 +249,7 @@ def assess_tool(
         ClosureError: If the machine cannot reach a point, or no box of ±1 mm.
         ParameterError: If a condition is out of range, or nothing depends on it.
     """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     use = None
     if conditions is not None:
         conditions.require_valid(calibration.robot)

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import expanded_uncertainty, find_entries
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
@@ -41,7 +40,7 @@ from orthocal.calibration.assessment_record import (
     FindingKind,
 )
 from orthocal.calibration.build_record import assemble_calibration
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.calibration.recorded_robot import require_calibrated_robot
 from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
@@ -222,7 +221,7 @@ def validate_calibration(
         NotIdentifiableError: If the sessions do not determine the parameters.
         SolverError: If the fit of the new readings does not converge.
     """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
     fit, refit = _refit(calibration, join_sessions(measured))

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Mask
 from orthocal.calibration.machine import Machine
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
@@ -20,6 +21,7 @@ from orthocal.effects.compensation import displace_drives
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.kinematics.conditions import APPROACH
 from orthocal.robot.model import Robot
+from orthocal.robot.parameters import suggest
 from orthocal.sensors.protocol import is_difference
 from orthocal.statistics.chance import bounded_interval, expanded_uncertainty
 
@@ -37,7 +39,7 @@ class Calibration(CalibrationRecord):
         for p in self.parameters:
             if p.name == name:
                 return p
-        raise KeyError(name)
+        raise KeyError(f"{name}{suggest(name, (p.name for p in self.parameters))}")
 
     @property
     def free(self) -> tuple[ParameterEstimate, ...]:
@@ -322,6 +324,12 @@ class Calibration(CalibrationRecord):
         import orthocal  # here, as the output depends on this module
 
         return orthocal.summarize(self, html=True)
+
+
+def require_calibration(value: object) -> None:
+    """Raise a TypeError unless an argument is a calibration."""
+    expected = "a Calibration, such as load_calibration(...)"
+    require_kind(value, Calibration, expected=expected)
 
 
 def propagate_stds(gain: Array, covariances: Sequence[Array]) -> Array:

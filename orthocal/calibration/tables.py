@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.io.fields import finite_or_none
 from orthocal.session.session import Conditions
 
@@ -21,6 +21,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
     from noise), `std_scaled` (its part from errors that the tolerance scale multiplies), `low` and
     `high` (value ± expanded uncertainty), and `prior_std` are in `unit`.
     """
+    require_calibration(calibration)
     intervals = dict(
         zip((p.name for p in calibration.free), calibration.intervals, strict=True),
     )
@@ -51,6 +52,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
 
 def reading_table(calibration: Calibration) -> list[Record]:
     """Records of all rows of readings, in metres except `studentised` and the conditions."""
+    require_calibration(calibration)
     return [
         {
             "setup": r.setup,

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.estimation.mirrored_starts import (
@@ -85,6 +86,8 @@ class CalibrationProblem:
     def __init__(
         self, session: Session, selection: Selection, *, noise_ratio: Array | None = None
     ) -> None:
+        require_kind(session, Session, expected="a Session, such as load_session(...)")
+        require_kind(selection, Selection, expected="a Selection, such as Choice(...).select(...)")
         self.session = session
         self.robot = session.robot
         self.machine_selection = selection

@@ -142,7 +142,7 @@ class ParameterSet:
             return self._parameters[name]
         except KeyError:
             raise ParameterError(
-                f"'{name}' is not an error parameter{_suggest(name, self._parameters)}"
+                f"'{name}' is not an error parameter{suggest(name, self._parameters)}"
             ) from None
 
     @property
@@ -249,7 +249,7 @@ class ParameterSet:
                 names = [name for name in self._parameters if fnmatchcase(name, glob)]
             if not names:
                 raise ParameterError(
-                    f"'{glob}' matches no error parameter{_suggest(glob, self._parameters)}"
+                    f"'{glob}' matches no error parameter{suggest(glob, self._parameters)}"
                 )
             if pattern.startswith("!"):
                 chosen.difference_update(names)
@@ -478,7 +478,7 @@ def build_parameters(
         if not names:
             raise ParameterError(
                 f"tolerances.overrides: '{glob}' matches no error parameter"
-                f"{_suggest(glob, parameters)}"
+                f"{suggest(glob, parameters)}"
             )
         for name in names:
             _check_unit(key, unit, parameters[name])
@@ -505,7 +505,7 @@ def _sum_errors(
         term = member.removeprefix("-")
         if term not in errors:
             raise ParameterError(
-                f"parameters.{name}: '{term}' is not an elementary error{_suggest(term, errors)}"
+                f"parameters.{name}: '{term}' is not an elementary error{suggest(term, errors)}"
             )
         if term in terms:
             raise ParameterError(f"parameters.{name}: '{term}' occurs twice")
@@ -528,7 +528,7 @@ def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
         )
 
 
-def _suggest(name: str, names: Iterable[str]) -> str:
+def suggest(name: str, names: Iterable[str]) -> str:
     """Hint with similar names, for messages."""
     close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     return f"; did you mean {', '.join(close)}?" if close else ""

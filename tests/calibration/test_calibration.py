@@ -171,8 +171,8 @@ def test_with_priors_sigma_and_solution_agree():
 
 
 def test_an_unknown_parameter_is_a_key_error(result):
-    with pytest.raises(KeyError):
-        result["w_slide.offset"]
+    with pytest.raises(KeyError, match=r"x_slide\.ofset; did you mean x_slide\.offset"):
+        result["x_slide.ofset"]
 
 
 def test_the_uncertainty_of_an_entry_has_all_parts():

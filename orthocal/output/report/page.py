@@ -11,10 +11,9 @@ from pathlib import Path
 
 from rich.console import Group
 
-from orthocal.arguments import require_kind
 from orthocal.assessment.circular_deviation import find_circles
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import require_suffix, write_file
 from orthocal.io.html import escape, heading, items, page, paragraph, table
@@ -97,7 +96,7 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
     Raises:
         OrthocalError: If the robot is missing or differs from the calibrated one.
     """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
     sensors = render_sensors(calibration)
     if saved is None and calibration.path is not None:
