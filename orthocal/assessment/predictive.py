@@ -33,6 +33,7 @@ from orthocal.statistics.distributions import (
     f_tail,
     incomplete_beta,
     least_number,
+    median_of_largest,
 )
 from orthocal.statistics.noise import FEW_DOF, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
@@ -72,19 +73,13 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
         calibration: The calibration.
         fit: Fit of the same parameters to the new session.
     """
-    problem, n = fit.problem, fit.problem.n_machine
+    problem = fit.problem
     noise = _predict_noise(calibration, fit)
     dof = problem.observations.size - problem.observations.n_free_zeros
     if not (np.all(noise.sigma > 0.0) and noise.dof > 0.0 and dof > 0):
         return DeviationTest(math.nan, math.nan)
-    covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
-    scale = problem.theta_scale
-    covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(
-        scale[:n], scale[:n]
-    )
-    variances, directions = np.linalg.eigh(covariance)
-    root = directions * np.sqrt(np.maximum(variances, 0.0))
-    centre = np.append([p.value for p in calibration.free], problem.prior_mean[n:])
+    root = _root_of_covariance(calibration, fit)
+    centre = np.append([p.value for p in calibration.free], problem.prior_mean[problem.n_machine :])
     square, worst_setup = _least_square(fit, centre, root, noise.sigma)
 
     def p_value(factor: float) -> float:
@@ -95,6 +90,24 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
 
     critical_factor = least_number(lambda f: p_value(f) < BY_CHANCE) if square > 0.0 else math.nan
     return DeviationTest(p_value(1.0), critical_factor, worst_setup)
+
+
+def _root_of_covariance(calibration: Calibration, fit: Fit) -> Array:
+    """Square root R of the covariance R Rᵀ of calibrated parameters and new mountings.
+
+    Args:
+        calibration: The calibration.
+        fit: Fit of the same parameters to the new session.
+
+    Returns:
+        Shape (n_free, n_free), [prior std].
+    """
+    problem, n = fit.problem, fit.problem.n_machine
+    covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
+    scale = problem.theta_scale[:n]
+    covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(scale, scale)
+    variances, directions = np.linalg.eigh(covariance)
+    return np.asarray(directions * np.sqrt(np.maximum(variances, 0.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,17 +234,34 @@ def _find_worst_setup(residual: Array, along: Array, observations: Observations)
     return min(probabilities, key=lambda setup: probabilities[setup])
 
 
-def expect_rms(calibration: Calibration, fit: Fit) -> float:
-    """Predicted RMS of the deviations in the rows of a new session, [m].
+@dataclass(frozen=True, slots=True)
+class ExpectedDeviations:
+    """Deviations of the rows of a new session that a calibration predicts; NaN if unknown."""
 
-    It combines the noise of the readings with the effect of the mountings of both sessions:
-    sqrt(rms² + tr(J (G_old + G_new) Jᵀ) / n). Of the same gauges rms is the RMS residual of the
-    calibration, of others in proportion to their noise.
+    rms: float
+    """RMS of the deviations, [m]."""
+    largest: float
+    """Largest deviation, [m]."""
+
+
+def expect_deviations(calibration: Calibration, fit: Fit) -> ExpectedDeviations:
+    """Deviations that a calibration predicts in the rows of a new session.
+
+    Deviations are from the calibrated machine with the mountings of `fit`. With priors their
+    variances follow to first order from those of noise, errors and mountings; the largest is the
+    median of the largest of as many independent ones. Without priors unmodelled errors exceed the
+    noise and repeat. The deviations are then, as in the paper, the residuals of the calibration,
+    and the effect of the mountings of both sessions: sqrt(rms² + tr(J (G_old + G_new) Jᵀ) / n). Of
+    the same gauges rms is the RMS residual of the calibration, of others in proportion to their
+    noise.
 
     Args:
         calibration: The calibration.
         fit: Fit of the same parameters to the new session.
     """
+    noise = _predict_noise(calibration, fit).sigma
+    if calibration.prior:
+        return _expect_with_priors(calibration, fit, noise)
     problem, n = fit.problem, fit.problem.n_machine
     mounting_covariance = restore_mounting_covariance(calibration) + fit.mounting_covariance
     jacobian = project_out_zeros(
@@ -243,10 +273,47 @@ def expect_rms(calibration: Calibration, fit: Fit) -> float:
     entries_per_row = sum(1.0 + problem.session.is_difference(r) for r in rows) / len(rows)
     counts = [k.readings for k in calibration.gauges]
     old = [_of_calibration(calibration, k)[0] ** 2 for k in calibration.gauges]
-    new = np.mean(_predict_noise(calibration, fit).sigma ** 2)
-    ratio = float(new / np.average(old, weights=counts))
-    rms_square = calibration.rms_after**2 * (ratio if math.isfinite(ratio) else 1.0)
-    return math.sqrt(rms_square + entries_per_row * square / len(rows))
+    ratio = float(np.mean(noise**2) / np.average(old, weights=counts))
+    before, largest = calibration.rms_after, calibration.largest_after
+    rms_square = before**2 * (ratio if math.isfinite(ratio) else 1.0)
+    rms = math.sqrt(rms_square + entries_per_row * square / len(rows))
+    return ExpectedDeviations(rms, rms / before * largest if before else rms)
+
+
+def _expect_with_priors(calibration: Calibration, fit: Fit, noise: Array) -> ExpectedDeviations:
+    """Deviations from noise, uncertain parameters and mountings; arguments as above.
+
+    The fit with the normal matrix A = Jᵀ J + P⁻¹ finds the mountings ν + A⁻¹_ν (Jᵀ e − P⁻¹ x) with
+    the noise e and all true parameters x = (θ, ν), from their means. The machine θ = θ₁ + δ thus
+    deviates from the calibrated one θ₁ by J_θ δ + e − J_ν A⁻¹_ν (Jᵀ e − P⁻¹ x).
+    """
+    if not np.all(noise > 0.0):
+        return ExpectedDeviations(math.nan, math.nan)
+    problem, n = fit.problem, fit.problem.n_machine
+    o, precision = problem.observations, problem.prior_precision
+    along = project_out_zeros(fit.jacobian * (problem.noise_ratio / noise)[:, None], o)
+    information = along.T @ along
+    mounting = along[:, n:] @ np.linalg.inv(information + np.diag(precision))[n:]
+    calibrated = np.array([p.value for p in calibration.free])
+    from_mean = (calibrated - problem.prior_mean[:n]) / problem.theta_scale[:n]
+    by_errors = mounting * precision
+    known = by_errors[:, :n] @ from_mean
+    by_errors[:, :n] += along[:, :n]
+    by_errors = by_errors @ _root_of_covariance(calibration, fit)
+
+    def rows(entries: Array) -> Array:
+        return o.rows((entries.T * noise).T)
+
+    # a mean over n entries with one zero has 1/n of the variance of an entry
+    share = np.where(o.zero_known, 0.0, 1.0 / np.bincount(o.zero, minlength=o.n_zeros))[o.zero]
+    single = o.minus < 0
+    variances = noise[o.plus] ** 2 * np.where(single, 1.0 - share[o.plus], 1.0)
+    variances += np.where(single, 0.0, noise[o.minus] ** 2)
+    of_mounting = rows(mounting)
+    variances += (of_mounting * (of_mounting @ information - 2.0 * rows(along))).sum(axis=1)
+    squares = np.maximum(variances, 0.0) + (rows(by_errors) ** 2).sum(axis=1) + rows(known) ** 2
+    rms = math.sqrt(float(np.mean(squares)))
+    return ExpectedDeviations(rms, median_of_largest(np.sqrt(squares)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,7 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank, verdic
 from orthocal.assessment.predictive import (
     DeviationTest,
     Repetition,
-    expect_rms,
+    expect_deviations,
     judge_deviations,
     measure_repetition,
 )
@@ -230,9 +230,9 @@ def validate_calibration(
     anomalies = find_anomalies(all_sessions)
     judgement = judge_session(all_sessions, anomalies=anomalies)
     mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
-    expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
+    expected, test = expect_deviations(calibration, fit), judge_deviations(calibration, fit)
     explained = _explain_deviations(anomalies, before, fit.problem.session)
-    agreement = _describe_agreement(refit, fit, test, expected_rms, judgement, explained=explained)
+    agreement = _describe_agreement(refit, fit, test, expected.rms, judgement, explained=explained)
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
@@ -243,8 +243,8 @@ def validate_calibration(
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
-        expected_rms=expected_rms,
-        expected_largest=_expect_largest(calibration, expected_rms),
+        expected_rms=expected.rms,
+        expected_largest=expected.largest,
         excess_probability=test.p_value,
         refit=refit,
         joint=joint,
@@ -517,13 +517,6 @@ def _find_further_change(joint: Calibration) -> list[Finding]:
     if joint.session.firmware is not None:
         return [words.further_settings()]
     return [words.further_change([e for e in assessment.entries if is_significant(joint, e)])]
-
-
-def _expect_largest(calibration: Calibration, expected_rms: float) -> float:
-    """Predicted largest deviation, [m]: largest residual of the calibration, scaled by the RMS."""
-    if calibration.rms_after == 0.0:
-        return expected_rms
-    return expected_rms / calibration.rms_after * calibration.largest_after
 
 
 def _decide(

@@ -22,6 +22,18 @@ def normal_quantile(share: float) -> float:
     return NormalDist().inv_cdf(share)
 
 
+def median_of_largest(stds: Array) -> float:
+    """Median of the largest absolute value of independent normal variables with mean 0.
+
+    Args:
+        stds: Their standard deviations, shape (n,), positive.
+    """
+    from scipy.special import erf
+
+    scales = math.sqrt(2.0) * stds
+    return least_number(lambda limit: float(np.prod(erf(limit / scales))) > 0.5)
+
+
 def log_positive_share(mean: Array, covariance: Array) -> float:
     """Logarithm of the probability that all variables of a normal distribution are positive.
 

@@ -36,7 +36,12 @@ from orthocal.assessment.controller_entries import (
     find_entries,
 )
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.predictive import Repetition, judge_deviations, measure_repetition
+from orthocal.assessment.predictive import (
+    Repetition,
+    expect_deviations,
+    judge_deviations,
+    measure_repetition,
+)
 from orthocal.assessment.validation import ENTRY_KINDS
 from orthocal.assessment.wording import join_texts
 from orthocal.assessment.words import validation as words
@@ -44,13 +49,16 @@ from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
-from orthocal.calibration.refit import repeat_fit
+from orthocal.calibration.refit import repeat_calibration, repeat_fit
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.output.text.summary import result_json
 from orthocal.statistics.chance import BY_CHANCE
 
 QUICK = {"solver": "variable-projection"}
+
+MACHINES = 25
+"""Machines of which expected and actual deviations are compared."""
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +126,24 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(paper, experiment_3
     assert document["schema"] == "orthocal/validation/4"
     assert document["confirmed"] is True
     assert document["nothing_to_change"] is True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["workshop", "table1/experiment-2"])
+def test_deviations_with_priors_are_as_large_as_expected(name):
+    """Machines drawn by the tolerances, measured twice; other mountings, nothing entered."""
+    plan, sizes = session_of(name), []
+    for seed in range(MACHINES):
+        errors = draw_machine(plan.robot, seed)
+        first, second = (simulate_session(plan, errors, seed=seed + k).session for k in (0, 1000))
+        found = identified(first, "full")
+        expected = expect_deviations(found, repeat_fit(found, second))
+        refit = repeat_calibration(found, second)
+        sizes.append((expected.rms, refit.rms_before, expected.largest, refit.largest_before))
+    rms, achieved, median, largest = np.array(sizes).T
+    ratio = np.sqrt(np.mean(achieved**2) / np.mean(rms**2))
+    assert ratio == pytest.approx(1.0, abs=0.3)  # three standard deviations
+    assert 0.25 < np.mean(largest < median) < 0.9  # deviations that are correlated are smaller
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -11,7 +11,7 @@ from tolerances import KINEMATICS, TRUTH_BACK
 
 from orthocal import load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.predictive import expect_rms, judge_deviations
+from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
 from orthocal.calibration.refit import repeat_calibration, repeat_fit
 from orthocal.errors import SessionError
@@ -144,7 +144,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         fit = repeat_fit(found, second.session)
         chances.append(judge_deviations(found, fit).p_value)
         achieved = repeat_calibration(found, second.session).rms_before
-        sizes.append((expect_rms(found, fit), achieved))
+        sizes.append((expect_deviations(found, fit).rms, achieved))
     # one in a hundred is refused for its deviations
     assert binom.cdf(np.sum(np.array(chances) >= BY_CHANCE), SEEDS, 1 - BY_CHANCE) > 0.01
     # an offset is compared with the one entered, which is as uncertain: 2 / √2 standard deviations
