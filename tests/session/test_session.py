@@ -60,6 +60,12 @@ def test_postures_by_tool_and_by_joints_are_equal(tmp_path, experiment_2):
     assert np.abs(by_joints.postures["x_max"].drives - tool).max() < KINEMATICS
 
 
+def test_a_session_without_its_robot_names_the_key(tmp_path):
+    folder = write(tmp_path / "moved", head=HEAD.replace("robot: orthoglide", "robot: .."))
+    with pytest.raises(SessionError, match=r"session\.yaml: robot: found '\.\.', .* no URDF"):
+        load_session(folder)
+
+
 def test_active_offsets_are_subtracted_from_the_drive_coordinates(tmp_path):
     plain = load_session(write(tmp_path / "plain"))
     head = HEAD + "controller: {offsets_mm: [0.5, -0.3, 0.2]}\n"
