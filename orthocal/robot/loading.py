@@ -84,10 +84,10 @@ def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
             f"'{robot}' is neither a robot of orthocal ({', '.join(packaged)}) "
             f"nor a directory ({folder})"
         )
-    if beside is not None and not any(folder.glob("*.urdf")):
+    if beside is not None and not any((*folder.glob("*.urdf"), *folder.glob("*.yaml"))):
         raise RobotError(
-            f"found '{robot}', expected the directory of a robot; {folder} has no URDF. A session "
-            "that was moved needs the new path of its robot"
+            f"found '{robot}', expected the directory of a robot; {folder} has no URDF and no YAML. "
+            "A session that was moved needs the new path of its robot"
         )
     return _load_folder(folder)
 
