@@ -86,8 +86,8 @@ def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
         )
     if beside is not None and not any((*folder.glob("*.urdf"), *folder.glob("*.yaml"))):
         raise RobotError(
-            f"found '{robot}', expected the directory of a robot; {folder} has no URDF and no YAML. "
-            "A session that was moved needs the new path of its robot"
+            f"found '{robot}', expected the directory of a robot; {folder} has no URDF and no "
+            "YAML. A session that was moved needs the new path of its robot"
         )
     return _load_folder(folder)
 
