@@ -136,8 +136,10 @@ def test_session_with_active_offsets_is_to_be_validated(folder, run):
     assert "All 6 readings are recorded." in out
     assert f"by their calibration,\n  orthocal validate CALIBRATION {folder}\n" in out
     assert out.rstrip().endswith(f"sessions together:\n  orthocal calibrate EARLIER {folder}")
-    (folder / "sheet.html").touch()
-    assert "by their calibration (sheet.html names it),\n" in run(folder)[1]
+    with (folder / "session.yaml").open("a") as stream:
+        stream.write("offsets_from: ../out/one\n")
+    entered = folder.parent / "out/one"
+    assert run(folder)[1].rstrip().endswith(f"Next:\n  orthocal validate {entered} {folder}")
 
 
 def test_instructions_of_a_setup_and_a_posture(folder, run):

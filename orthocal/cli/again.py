@@ -76,6 +76,7 @@ def again(
     else:
         joints = read_controller_joints(ini, result.robot)
         new = replace(new, compensation=joints.compensation)
+    new = replace(new, offsets_from=calibration)
     _write(new, out, f"orthocal validate {quote_path(os.path.relpath(calibration, out))} .")
     if order := note_wrong_order(result):
         put_note(order)

@@ -270,6 +270,8 @@ class Session:
     """Active offsets, shape (n_drives,), [m, rad]; None if not stated."""
     compensation: Compensation = ()
     """Compensation of backlash and errors of screws by the controller; empty if not stated."""
+    offsets_from: Path | None = None
+    """Path to the calibration whose offsets were entered; None if not stated."""
     firmware: DeltaSettings | None = None
     """Settings of the firmware of a delta printer; postures are in its coordinates."""
     adjusted: Mapping[str, float] = field(default_factory=dict)
@@ -411,7 +413,7 @@ class Session:
         )
 
     def with_controller(self, offsets: ArrayLike) -> Session:
-        """Session of the same postures with other active offsets.
+        """Session of the same postures with other active offsets, of no stated calibration.
 
         Args:
             offsets: Active offsets, shape (n_drives,), [m, rad].
@@ -422,7 +424,13 @@ class Session:
             name: replace(p, drives=read_only(p.drives + shift))
             for name, p in self.postures.items()
         }
-        return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
+        return replace(
+            self,
+            postures=postures,
+            controller_offsets=read_only(active),
+            offsets_from=None,
+            sha256="",
+        )
 
     def on_printer(self, robot: Robot, homed: ArrayLike) -> Session:
         """Session of a printer in the coordinates of its robot before settings changed.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -407,6 +408,9 @@ def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
         setups=setups,
         readings=(),
         controller_offsets=offsets,
+        offsets_from=(
+            Path(os.path.normpath(file.parent / keys.offsets_from)) if keys.offsets_from else None
+        ),
         compensation=compensation,
         firmware=firmware,
         adjusted={name: amount * MM for name, amount in keys.adjusted_mm.items()},

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Keys, Name, Number, PositiveNumber
@@ -18,6 +18,9 @@ from orthocal.sensors.protocol import LARGEST_READING
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit
+
+LONGEST_PATH = 1000
+"""Largest number of characters of a path."""
 
 MAX_DRIVES = 12
 """Largest number of drives, and of coordinates of a posture."""
@@ -221,6 +224,17 @@ class CalibrationKeys(Keys):
     """Effects beside geometry; by default those of the robot's YAML."""
 
 
+def _require_path(text: str) -> str:
+    """Refuse an empty text, and characters that no path on one line has."""
+    if not text.isprintable() or not 0 < len(text) <= LONGEST_PATH:
+        raise ValueError(f"found {text[:40]!r}; expected a path")
+    return text
+
+
+PathText = Annotated[str, AfterValidator(_require_path)]
+"""Path on one line."""
+
+
 class SessionKeys(Keys):
     """Keys of a session.yaml, or of a plan, which has no `readings`."""
 
@@ -236,6 +250,8 @@ class SessionKeys(Keys):
     payload_kg: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool during the measurement."""
     controller: ControllerKeys | None = None
+    offsets_from: PathText | None = None
+    """Path to the calibration whose offsets were entered, relative to the file."""
     adjusted_mm: Annotated[dict[Name, Adjusted], Field(max_length=MOST_NAMES)] = {}
     """Amounts of the mechanical adjustments since the machine was built, by name."""
     calibration: CalibrationKeys | None = None

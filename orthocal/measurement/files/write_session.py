@@ -201,6 +201,9 @@ def write_session(
     folder = Path(folder)
     document = session_document(session)
     document["robot"] = _place_robot(session, folder)
+    if session.offsets_from is not None:
+        entered = os.path.relpath(session.offsets_from.resolve(), folder.resolve())
+        document["offsets_from"] = entered
     heading = "".join(f"# {line}\n" for line in comment.splitlines())
     text = heading + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100

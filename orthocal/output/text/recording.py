@@ -8,7 +8,6 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
@@ -25,7 +24,6 @@ from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
-from orthocal.output.sheet.page import SHEET
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name
@@ -438,12 +436,14 @@ class RecordingText:
         if warnings:
             following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
         elif session.controller_offsets is not None and any(session.controller_offsets):
-            which = " (sheet.html names it)" * (Path(path) / SHEET).is_file()
             following = (
-                f"Next: validate the offsets that were entered, by their calibration{which},\n"
+                "Next: validate the offsets that were entered, by their calibration,\n"
                 f"  orthocal validate CALIBRATION {command}\n"
                 f"or calibrate all sessions together:\n  orthocal calibrate EARLIER {command}"
             )
+            if session.offsets_from is not None:
+                entered = printable(shlex.quote(str(session.offsets_from)))
+                following = f"Next:\n  orthocal validate {entered} {command}"
         return "\n".join([*(self.wrap(line) for line in lines), following])
 
 
