@@ -172,6 +172,8 @@ def test_again_writes_the_same_plan_with_active_offsets(calibrated, experiment, 
     assert f"<code>{validated}</code>" in (out / "sheet.html").read_text()
     assert f"# {validated}\n" in (out / "session.yaml").read_text()
     assert second.offsets_from.resolve() == calibrated.resolve()
+    code, _, err = orthocal("sheet", out, "--force", "--dwell", 2)
+    assert (code, validated in (out / "sheet.html").read_text()) == (0, True)
     code, _, err = orthocal("again", calibrated, "--out", out)
     assert code == 2
     assert err == f"orthocal: {out}/session.yaml: exists already; --force overwrites it\n"

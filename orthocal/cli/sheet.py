@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import orthocal
 from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command, read_numbers
 from orthocal.cli.overwriting import require_replaceable_results
@@ -38,12 +40,18 @@ def sheet(
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
+    from orthocal.output.text.answer import quote_path
 
     x, y, z = read_numbers(shift_mm, "--shift-mm", "XYZ")
     options = ProgramOptions(feed, approach_feed, (x, y, z), dwell, trigger)
     directory = out or (session if is_folder(session) else session.parent)
     require_writable(directory)
-    files = sheet_files(orthocal.load_plan(session), options=options)
+    plan, following = orthocal.load_plan(session), ""
+    if plan.offsets_from is not None:
+        following = (
+            f"orthocal validate {quote_path(os.path.relpath(plan.offsets_from, directory))} ."
+        )
+    files = sheet_files(plan, options=options, following=following)
     require_replaceable_results(directory, files, force=force)
     write_files(directory, files)
     count = len(files) - 1
