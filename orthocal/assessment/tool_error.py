@@ -72,7 +72,10 @@ class ErrorStatistics:
 
     @property
     def percentile_95(self) -> float:
-        """95 % quantile of the errors over all points."""
+        """95 % quantile over the points, and over the distribution of uncertain errors.
+
+        For uncertain errors it can exceed `largest`, which is an RMS.
+        """
         return self.find_percentile()
 
     def to_document(self) -> dict[str, float]:
