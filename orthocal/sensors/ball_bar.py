@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from orthocal.arrays import Array
-from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.io.documents import Name, Number
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.mounting import LARGEST_SCALE, SCALE
 from orthocal.sensors.protocol import (
@@ -47,6 +47,9 @@ UNKNOWN_LENGTH_STD = 1.0 * MM
 SAGITTA = 5e-6
 """Largest deviation of a chord from the arc between two readings, [m]."""
 
+SHORTEST_MM = 5.0
+"""Length of the shortest accepted bar, [mm]; a smaller number has a wrong unit."""
+
 LARGEST_MM = 5000.0
 """Largest accepted length and coordinate, [mm]; a larger one has a wrong unit."""
 
@@ -66,7 +69,7 @@ class BallBarKeys(SetupKeys):
     """Tolerance of each coordinate of the fixed ball; 0 if the position is known."""
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Ball at the tool, from the tool centre point, in the tool's frame."""
-    length_mm: Annotated[PositiveNumber, Field(le=LARGEST_MM)]
+    length_mm: Annotated[Number, Field(ge=SHORTEST_MM, le=LARGEST_MM)]
     """Distance of the balls at reading 0."""
     length_tolerance_mm: Tolerance | Literal["unknown"] = 0.0
     """Tolerance of the length; 0 if it is known."""
