@@ -209,7 +209,7 @@ def test_approaches_and_minutes_of_a_bar_follow_from_path_and_file(owned, monkey
         (BAR + "minutes_per_reading: -1\n", "minutes_per_reading"),
         (BAR.replace("length_mm: 50", "length_mm: long"), "length_mm"),
         (BAR.replace("length_mm: 50\n", ""), "length_mm"),
-        (BAR.replace("length_mm: 50", "length_mm: 0.05"), "length_mm: found '0.05'"),
+        (BAR.replace("length_mm: 50", "length_mm: 0.05"), "length_mm"),
         (BAR.replace("length_mm: 50", "lenght_mm: 50"), "lenght_mm"),
         (BAR + "tool_mm: [1]\n", "tool_mm"),
         (BAR + "postures: [zero]\n", "postures"),
