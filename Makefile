@@ -15,7 +15,7 @@ TESTED = $(VENV)/.installed-test
 DOCUMENTED = $(VENV)/.installed-docs
 
 PIP = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
-# uv takes a fifth of the time of pip, but does not read pip's settings for proxies and mirrors
+# uv is several times as fast as pip, but does not read pip's settings for proxies and mirrors
 define install
 $(PIP) uv && $(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python --editable '$(1)' || \
 	  $(PIP) --no-compile --editable '$(1)'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from tolerances import KINEMATICS
 
@@ -11,6 +12,7 @@ from orthocal.statistics.distributions import (
     chi_square_tail,
     f_tail,
     incomplete_beta,
+    median_of_largest,
     normal_quantile,
     t_quantile,
 )
@@ -40,3 +42,10 @@ def test_distributions_at_their_ends():
     assert chi_square_tail(3.0, 0.0) == 1.0
     assert chi_square_tail(3.0, float("inf")) == chi_square_tail(0.0, 1.0) == 0.0
     assert (incomplete_beta(0.5, 2.0, 0.0), incomplete_beta(0.5, 2.0, 1.0)) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("stds", [[2.0], [1.0] * 10, [0.1, 1.0, 3.0]])
+def test_the_median_of_the_largest_is_that_of_samples(stds):
+    drawn = np.random.default_rng(1).normal(size=(40_000, len(stds))) * stds
+    largest = np.abs(drawn).max(axis=1)
+    assert median_of_largest(np.array(stds)) == pytest.approx(np.median(largest), rel=0.02)
