@@ -16,7 +16,10 @@ import sys
 import pytest
 from commands import run_orthocal
 
-pytestmark = pytest.mark.smoke
+pytestmark = [
+    pytest.mark.smoke,
+    pytest.mark.usefixtures("quick_plans", "module_without_sensor_gains"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ from orthocal.viewer.visuals import Visual
 BLUE, ORANGE, GREEN, GREY = "#0063a6", "#c55a00", "#007a4d", "#8a8f98"
 BLACK, DARK, TOUCHED = "#222", "#4d5661", "#9cc7e6"
 
-MACHINE_SIZE = (104.0, 88.0)
+MACHINE_SIZE = (104.0, 80.0)
 """Width and height of the picture of the machine, [mm]."""
 
 SECTION_SIZE = (68.0, 68.0)
