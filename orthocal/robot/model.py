@@ -546,10 +546,9 @@ def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
     """Lower and upper bounds of the joint coordinates, shape (nv,) each; infinite if unbounded."""
     model = robot.model
     lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
-    for joint in list(model.joints)[1:]:
-        if joint.nq == 1:
-            lower[joint.idx_v] = model.lowerPositionLimit[joint.idx_q]
-            upper[joint.idx_v] = model.upperPositionLimit[joint.idx_q]
+    single = np.flatnonzero(np.array(model.nqs) == 1)
+    in_q, in_v = np.array(model.idx_qs)[single], np.array(model.idx_vs)[single]
+    lower[in_v], upper[in_v] = model.lowerPositionLimit[in_q], model.upperPositionLimit[in_q]
     return lower, upper
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shutil
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -331,6 +332,9 @@ def test_bad_input_is_refused(root, tmp_path, arguments, message):
 PRINTED = 184.0 / 25.4 * 96.0
 """Width of the text of an A4 page within the sheet's margins, [px]."""
 
+PAGE_HEIGHT = (297.0 - 2.0 * 12.0) / 25.4 * 96.0
+"""Height of an A4 page within the sheet's margins, [px]."""
+
 
 @pytest.mark.parametrize("effects", [(), ("backlash", "thermal", "drift")])
 def test_tables_of_readings_are_as_wide_as_the_text(small, effects, tmp_path):
@@ -353,3 +357,39 @@ def test_tables_of_readings_are_as_wide_as_the_text(small, effects, tmp_path):
         )
     assert max(right for right, _ in widths) <= round(PRINTED) + 0.5
     assert max(columns for _, columns in widths) == (12 if effects else 9)
+
+
+def test_a_setup_of_ten_readings_fits_on_a_page(tmp_path):
+    """As the front page does, with offsets and backlash that are compensated."""
+    make_robot(SMALL, tmp_path / "mine", counting=COUNTING)
+    postures, setups = "", ""
+    for k, leg in enumerate("xyz"):
+        for i in range(9):
+            position = [15 * i - 60 if axis == k else 0 for axis in range(3)]
+            postures += f"  {leg}{i}: {{tcp_mm: {position}}}\n"
+    for leg, direction in permutations("xyz", 2):
+        read = ", ".join(f"{leg}{i}" for i in range(9))
+        keys = f"leg: {leg}, direction: {direction}, section: {{fraction: 0.5}}"
+        setups += f"  {direction}{leg}: {{{keys}, postures: [{read}]}}\n"
+    (tmp_path / "plan.yaml").write_text(
+        "robot: mine\ntitle: second\ngauge: {range_mm: [-5, 5], resolution_mm: 0.01}\n"
+        "controller: {offsets_mm: [0.3, 0.5, -0.1], backlash_mm: [0.01, 0.02, 0.01]}\n"
+        f"postures:\n{postures}setups:\n{setups}"
+    )
+    plan = load_plan(tmp_path / "plan.yaml").with_effects(["backlash"])
+    approached = [replace(r, conditions=Conditions(approach="pnp")) for r in plan.readings]
+    plan = replace(plan, readings=tuple(approached))
+    path = tmp_path / "sheet.html"
+    path.write_text(sheet_files(plan)["sheet.html"])
+    with open_browser() as browser, visit(browser, path.as_uri()) as found:
+        found.page.set_viewport_size({"width": round(PRINTED), "height": 1000})
+        found.page.emulate_media(media="print")
+        front, *heights = found.page.evaluate(
+            """() => {
+                 const boxes = [...document.querySelectorAll('section[id]')].map(
+                     (section) => section.getBoundingClientRect());
+                 return [boxes[0].top, ...boxes.map((box) => box.height)];
+               }"""
+        )
+    assert len(heights) == 6
+    assert max(front, *heights) <= PAGE_HEIGHT
