@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from importlib.metadata import distribution
+from importlib.util import cache_from_source
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -39,12 +40,15 @@ def declared(requirements):
 def make_environment(folder, distributions):
     """An environment with the files of distributions, by hard links where that can be; its Python.
 
-    What they have outside of their library folder, such as commands, is left out.
+    They come with what is compiled of them. What they have outside of their library folder, such as
+    commands, is left out.
     """
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     (library,) = folder.glob("lib/python*/site-packages")
     for own in distributions:
-        for file in own.files or ():
+        files = [Path(file) for file in own.files or ()]
+        compiled = [Path(cache_from_source(f)) for f in files if f.suffix == ".py"]
+        for file in dict.fromkeys([*files, *compiled]):
             source, target = Path(own.locate_file(file)), library / file
             if ".." in file.parts or not source.exists():
                 continue

@@ -51,12 +51,14 @@ def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
     """A fresh environment: the wheel and what it declares, nothing else."""
     needed = declared(requirements_of(wheel))
     python = make_environment(tmp_path / "env", needed)
-    pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check"]
-    install = ["install", "--quiet", "--no-compile", "--no-index", "--no-deps", wheel]
+    pip = [sys.executable, "-m", "uv", "pip"]
+    into = ["--quiet", "--python", python]
+    install = ["install", "--no-index", "--no-deps", *into, wheel]
     subprocess.run([*pip, *install], check=True)
-    check = subprocess.run([*pip, "check"], capture_output=True, text=True)
-    assert check.returncode == 0, check.stdout
-    listed = subprocess.run([*pip, "freeze", "--all"], capture_output=True, text=True, check=True)
+    check = subprocess.run([*pip, "check", "--python", python], capture_output=True, text=True)
+    assert check.returncode == 0, check.stderr
+    freeze = [*pip, "freeze", "--python", python]
+    listed = subprocess.run(freeze, capture_output=True, text=True, check=True)
     assert len(listed.stdout.splitlines()) == 1 + len(needed)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
