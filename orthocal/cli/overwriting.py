@@ -85,12 +85,12 @@ def _require_no_readings(directory: Path) -> None:
             cannot be loaded, all readings count as measured.
     """
     from orthocal.assessment.wording import counted
-    from orthocal.measurement.files.session_file import load_rows
+    from orthocal.measurement.files.session_file import load_plan
 
     out_of_range: list[SessionError] = []
     table = directory / READINGS
     try:
-        session = load_rows(directory, wrong=out_of_range)
+        session = load_plan(directory, wrong=out_of_range)
     except OrthocalError:  # not a valid session
         count, path = 0, None
     else:

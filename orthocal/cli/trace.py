@@ -31,7 +31,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     directory receives session.yaml with a posture for each average, and readings.csv.
     """
     from orthocal.assessment.wording import counted
-    from orthocal.measurement.files.session_file import load_rows
+    from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.importing.traces import (
         FEWEST_SAMPLES,
         bin_traces,
@@ -40,7 +40,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     )
 
     require_new_session(out, FILES, force=force)
-    plan = load_rows(session)
+    plan = load_plan(session)
     files = _split(traces)
     by_setup = {name: read_trace(path, plan.robot) for name, path in files.items()}
     binned = bin_traces(plan, by_setup)

@@ -35,7 +35,7 @@ from orthocal.measurement.files.point_rows import (
 )
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
-from orthocal.measurement.files.session_file import load_rows, session_digest
+from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
@@ -372,7 +372,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         OutputError: If its directory is not writable.
     """
     wrong: list[SessionError] = []
-    session = load_rows(path, wrong=wrong)
+    session = load_plan(path, wrong=wrong)
     csv = _csv_of(session)
     _files_to_add(session)  # refused before anything is written
     with open_journal_file(
@@ -380,11 +380,11 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     ) as journal:
         lines = _read_lines(journal)
         if _is_outdated(session):  # another process may have written before the lock
-            session = load_rows(path, wrong=wrong)
+            session = load_plan(path, wrong=wrong)
         for file, content in _files_to_add(session).items():
             write_file(file, content)
         if session.readings_path is None:
-            session = load_rows(path, wrong=wrong)
+            session = load_plan(path, wrong=wrong)
         rows = session.readings
         table = read_file(csv, error=SessionError)
         pending, edited = _find_pending(lines, _digest(table))
@@ -396,7 +396,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         if pending:
             table = _table(rows, session)
             _write(csv, table)
-            session = load_rows(path, wrong=wrong)
+            session = load_plan(path, wrong=wrong)
         recording = Recording(
             session,
             rows,

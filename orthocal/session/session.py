@@ -178,7 +178,7 @@ class Reading:
     posture: str
     minus: str | None = None
     cycle: int = 1
-    value: float = 0.0
+    value: float = math.nan
     line: int | None = None
     file: Path | None = None
     conditions: Conditions | None = None
@@ -489,8 +489,8 @@ class Session:
         """Refuse a session that was made in Python and cannot be calibrated.
 
         Raises:
-            SessionError: If a sensor does not fit the robot, a reading names an unknown setup or
-                posture, or no reading of a gauge with a free zero has a value.
+            SessionError: If a sensor does not fit the robot, or a reading names an unknown setup or
+                posture or has no value.
         """
         for name, setup in self.setups.items():
             setup.sensor.require_fit(self.robot, where=f"setups.{name}")
@@ -500,9 +500,13 @@ class Session:
             for posture in (r.posture, *([] if r.minus is None else [r.minus])):
                 if posture not in self.postures:
                     _refuse_name(posture, "posture", self.postures)
-        relative = all(setup.zero == "free" for setup in self.setups.values())
-        if relative and not self.values.any() and all(r.line is None for r in self.readings):
-            raise SessionError("no reading has a value; expected readings, in m", where="readings")
+        missing = sum(not r.is_read for r in self.readings)
+        if missing:
+            count = len(self.readings)
+            raise SessionError(
+                f"{missing} of {count} readings have no value; expected readings, in m",
+                where="readings",
+            )
 
     def with_values(self, values: Sequence[float] | Array) -> Session:
         """Session with other readings.

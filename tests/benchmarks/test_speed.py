@@ -33,7 +33,7 @@ from orthocal.estimation.solvers.nlp import ProgramFunctions
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
-from orthocal.measurement.files.session_file import load_rows
+from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.importing.traces import Trace, bin_traces, with_traces
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates, measure_candidates
@@ -569,7 +569,7 @@ def test_bins_of_a_trace_are_calibrated_faster_than_its_samples(tmp_path, record
         "postures: {right: {tcp_mm: [50, 0, 0]}, up: {tcp_mm: [0, 0, 50]}}\n"
         f"setups:\n{setups}"
     )
-    plan = load_rows(tmp_path / "plan.yaml")
+    plan = load_plan(tmp_path / "plan.yaml")
     many, few = trace_circles(plan, 20_000), with_samples(plan, trace_circles(plan, 2_000))
 
     def solve(session):

@@ -13,7 +13,7 @@ from orthocal.errors import SessionError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
-from orthocal.measurement.files.session_file import load_rows
+from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.importing.traces import (
     Trace,
     bin_trace,
@@ -42,7 +42,7 @@ SETUP = (
 def plan(tmp_path_factory):
     folder = tmp_path_factory.mktemp("traces")
     (folder / "plan.yaml").write_text(PLAN + "".join(map(SETUP.format, PLANES)))
-    return load_rows(folder / "plan.yaml")
+    return load_plan(folder / "plan.yaml")
 
 
 def circle(plane, count, *, turns=1.0):

@@ -171,28 +171,12 @@ def _build_unread(file: Path, keys: SessionKeys) -> tuple[Session, Path]:
     return plan, file.parent / keys.readings
 
 
-def load_plan(path: str | Path) -> Session:
-    """Read a plan: a session.yaml without `readings`; each planned reading is 0.
+def load_plan(path: str | Path, *, wrong: list[SessionError] | None = None) -> Session:
+    """Read a plan: a session.yaml without `readings`. Readings without a value are NaN.
 
     A setup is read `cycles` times in all postures, or in those of its `postures`. A sensor that
     reads pairs of postures reads the first and second one, the third and fourth one and so on. A
-    session with readings is a plan of its rows; empty cells are 0.
-
-    Raises:
-        SessionError: If a file is wrong; names file and line or key.
-        RobotError: If the robot does not load.
-    """
-    session = load_rows(path)
-    return replace(
-        session,
-        readings=tuple(r if r.is_read else replace(r, value=0.0) for r in session.readings),
-    )
-
-
-def load_rows(path: str | Path, *, wrong: list[SessionError] | None = None) -> Session:
-    """Read a plan as `load_plan` does; missing readings are NaN.
-
-    In a plan without a readings.csv all readings are missing, and its `readings_path` is None.
+    session with readings is a plan of its rows; without a readings.csv its `readings_path` is None.
 
     Args:
         path: The session.yaml, or its directory.

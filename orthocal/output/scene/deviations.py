@@ -90,22 +90,24 @@ class Stop:
 def measure_deviations(session: Session) -> tuple[Deviation, ...]:
     """Readings minus predictions of the nominal machine with the active offsets.
 
-    Gauge zeros are fitted. All deviations of a plan without readings are zero.
+    Gauge zeros are fitted. Deviations of readings without a value are zero.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
     """
     deviations = np.zeros(len(session.readings))
-    if session.values.any():
-        observations = build_observations(session)
+    rows = np.flatnonzero(np.isfinite(session.values))
+    if rows.size:
+        read = session.select([session.readings[i] for i in rows])
+        observations = build_observations(read)
         active = {
             f"{drive.name}.offset": float(value)
             for drive, value in zip(session.robot.drives, session.active_offsets, strict=True)
             if value != 0.0
         }
-        predicted = predict_readings(session, active, observations=observations)
-        entries = observations.values(session.values) - predicted
-        deviations = observations.rows(project_out_zeros(entries, observations))
+        predicted = predict_readings(read, active, observations=observations)
+        entries = observations.values(read.values) - predicted
+        deviations[rows] = observations.rows(project_out_zeros(entries, observations))
     return _average(
         Deviation(r.setup, r.posture, r.minus, float(v), None)
         for r, v in zip(session.readings, deviations, strict=True)
@@ -135,7 +137,7 @@ def measurement_of_session(session: Session) -> Measurement:
         rows=measure_deviations(session),
         count=len(session.readings),
         largest_after=None,
-        planned=not session.values.any(),
+        planned=not np.isfinite(session.values).any(),
     )
 
 
