@@ -19,7 +19,7 @@ from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.tables.numerals import parse_typed_reading
 from orthocal.measurement import recording as module
 from orthocal.measurement.files import session_file
-from orthocal.measurement.files.session_file import load_plan, load_plan
+from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
