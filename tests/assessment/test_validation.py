@@ -137,8 +137,9 @@ def test_deviations_with_priors_are_as_large_as_expected(name):
         errors = draw_machine(plan.robot, seed)
         first, second = (simulate_session(plan, errors, seed=seed + k).session for k in (0, 1000))
         found = identified(first, "full")
-        expected = expect_deviations(found, repeat_fit(found, second))
-        refit = repeat_calibration(found, second)
+        fit = repeat_fit(found, second)
+        expected = expect_deviations(found, fit)
+        refit = assemble_calibration(fit, nominal=np.array([p.value for p in found.free]))
         sizes.append((expected.rms, refit.rms_before, expected.largest, refit.largest_before))
     rms, achieved, median, largest = np.array(sizes).T
     ratio = np.sqrt(np.mean(achieved**2) / np.mean(rms**2))

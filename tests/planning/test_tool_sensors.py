@@ -241,7 +241,7 @@ def test_a_wrong_file_is_refused_by_its_key(owned, text, place):
 def for_printer(owned):
     """Plan of an hour for a linear delta with a bar and a probe."""
     equipment = Equipment(owned=owned(bar=BAR, probe=PROBE), **FEW)
-    with few_balls(3):
+    with few_balls(1):
         return plan_readings(load_robot("linear_delta"), hours=1.0, equipment=equipment, starts=1)
 
 
@@ -284,13 +284,13 @@ def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
     assert {p.values[2] for p in postures.values()} == {0.02}
 
 
-@pytest.fixture
-def planned_bar(owned, monkeypatch):
+@pytest.fixture(scope="module")
+def planned_bar(owned):
     """Candidates and a planned setup of a ball bar with twelve postures."""
     robot = replace(with_effects(load_robot("linear_delta"), ["backlash"]), legs={})
     equipment = Equipment(owned=owned(bar=BAR.replace("length_mm: 50", "length_mm: 60")))
-    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:1])
-    session = list_candidates(robot, equipment)
+    with few_balls(1):
+        session = list_candidates(robot, equipment)
     forecast = ToolForecast(robot, resolve_choice("offsets", None).select(robot.parameters))
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     count = len(candidates.setups[0].rows)
@@ -411,6 +411,7 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
     assert needed_range(robot, sensors, entered=entered) == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.usefixtures("without_sensor_gains")
 def test_a_sensor_with_too_short_a_range_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
     short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
@@ -431,6 +432,7 @@ def test_a_sensor_with_too_short_a_range_is_named(owned):
     assert words.endswith(f"{remedy} or use a gauge of more range.")
 
 
+@pytest.mark.usefixtures("without_sensor_gains")
 def test_a_sensor_that_gains_less_than_others_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
     noisy = owned(bar=BAR.replace("sigma_mm: 0.002", "sigma_mm: 1"))
