@@ -49,7 +49,7 @@ from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
-from orthocal.calibration.refit import repeat_calibration, repeat_fit
+from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.output.text.summary import result_json
