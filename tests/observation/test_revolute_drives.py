@@ -13,7 +13,8 @@ from orthocal import load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
-from orthocal.calibration.refit import repeat_calibration, repeat_fit
+from orthocal.calibration.build_record import assemble_calibration
+from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import SessionError
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
@@ -143,7 +144,8 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
         chances.append(judge_deviations(found, fit).p_value)
-        achieved = repeat_calibration(found, second.session).rms_before
+        nominal = np.array([p.value for p in found.free])
+        achieved = assemble_calibration(fit, nominal=nominal).rms_before
         sizes.append((expect_deviations(found, fit).rms, achieved))
     # one in a hundred is refused for its deviations
     assert binom.cdf(np.sum(np.array(chances) >= BY_CHANCE), SEEDS, 1 - BY_CHANCE) > 0.01
