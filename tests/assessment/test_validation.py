@@ -254,10 +254,9 @@ def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3)
 
 
 def test_repetition_is_unknown_where_the_fit_absorbs_the_shared_lines():
-    session = session_of("workshop")
-    calibration = calibrated("workshop", "full")
-    entered = session.with_controller([e.enter for e in find_entries(calibration)])
-    result = validate_calibration(calibration, simulate_session(entered, {}, seed=3).session)
+    errors, session, calibration = calibrated_machine("workshop", "full", 1)
+    entered = session.with_controller(entered_offsets(calibration))
+    result = validate_calibration(calibration, simulate_session(entered, errors, seed=3).session)
     assert result.repetition.repeats is None
     assert result.repetition.matched == len({(r.setup, r.posture) for r in session.readings})
     (unknown,) = result.assessment.of_kind("repetition unknown")
@@ -371,7 +370,7 @@ def test_the_setup_to_read_again_is_the_one_that_disagrees_with_the_others():
     plan, named, unconfirmed = quick_plan().session, 0, 0
     for seed in range(4):
         errors = draw_machine(plan.robot, seed)
-        calibration = calibrate(simulate_session(plan, errors, seed=seed).session, **UNJUDGED)
+        calibration = identified(simulate_session(plan, errors, seed=seed).session)
         entered = plan.with_controller(entered_offsets(calibration))
         session = simulate_session(entered, errors, seed=seed + 1000).session
         setup = list(session.setups)[seed % len(session.setups)]
