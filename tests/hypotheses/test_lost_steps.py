@@ -8,7 +8,7 @@ from calibrated import plan_of
 from made_mistakes import sound_machine
 
 from orthocal import simulate_session
-from orthocal.assessment import judgement
+from orthocal.assessment.judgement import judge_session
 from orthocal.hypotheses.families.lost_steps import MAX_SCORED, lost_steps
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.linear_model import LinearModel
@@ -45,7 +45,7 @@ def measure(plan, drive, row, size, *, seed):
     ("drive", "row", "size"),
     [("x_slide", 8, 1e-3), ("y_slide", 7, -1e-3), ("z_slide", 8, 1e-3), ("y_slide", 8, 1.2e-3)],
 )
-def test_lost_steps_are_named_with_drive_place_and_amount(plan, monkeypatch, drive, row, size):
+def test_lost_steps_are_named_with_drive_place_and_amount(plan, drive, row, size):
     session = measure(plan, drive, row, size, seed=3)
     found = find_anomalies(session)
     (anomaly,) = found.found
@@ -54,8 +54,7 @@ def test_lost_steps_are_named_with_drive_place_and_amount(plan, monkeypatch, dri
     assert abs(e.first - 18 - row) <= 2
     assert e.amount == pytest.approx(size, abs=4.0 * e.std)
     assert found.explained
-    monkeypatch.setattr(judgement, "find_anomalies", lambda *_, **__: found)
-    assessment = judgement.judge_session(session)
+    assessment = judge_session(session, anomalies=found)
     (finding,) = [f for f in assessment.findings if f.kind == "lost steps"]
     assert assessment.verdict == "review"
     assert {p.parameter for p in finding.places} == {drive}
