@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from adjusting import reached, shimmed_plan
-from calibrated import UNJUDGED, calibrated
+from calibrated import UNJUDGED, identified, session_of
 from commands import orthocal as run
 
 from orthocal import (
@@ -220,7 +220,7 @@ def test_adjustments_with_uncertain_gain_are_details(plans):
 
 def test_a_robot_without_adjustments_is_refused():
     with pytest.raises(RobotError, match=r"orthocal\.adjustments"):
-        plan_adjustments(calibrated("table1/experiment-2", "offsets"))
+        plan_adjustments(identified(session_of("table1/experiment-2"), "offsets"))
 
 
 @pytest.mark.parametrize(("sign", "confirmed"), [(1.0, True), (-1.0, False)])

@@ -29,6 +29,7 @@ from orthocal.assessment.controller_entries import (
     expanded_uncertainty,
     is_worth_changing,
 )
+from orthocal.assessment.recommendation import Recommendation
 from orthocal.cli.correct import _find_lags
 from orthocal.effects.compensation import JointTrim
 from orthocal.kinematics.conditions import UseConditions
@@ -47,6 +48,9 @@ TRUTH = {
 """Drive z has no backlash."""
 
 NOISE = 6e-6
+
+KNOWN = {"judgement": SOUND, "recommendation": Recommendation("full", 1.0, (), 0.0)}
+"""Arguments of an assessment whose readings are sound, and whose model is not in question."""
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +193,7 @@ def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration
     stated = (JointTrim(0.02 * MM), JointTrim(), JointTrim())
     for trims in ((JointTrim(),) * 3, stated):
         record = replace(calibration.session, compensation=trims)
-        assessed = assess(replace(calibration, assessment=None, session=record), judgement=SOUND)
+        assessed = assess(replace(calibration, assessment=None, session=record), **KNOWN)
         assert not assessed.of_kind(kind)
     plans = [replace(plan, compensation=stated, path=Path("first/session.yaml"))]
     plans.append(replace(plan, path=Path("second/session.yaml")))
@@ -207,7 +211,7 @@ def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
     validation = validate_calibration(
         calibration, replace(session, compensation=(JointTrim(),) * 3)
     )
-    judged = assess(validation.joint, judgement=SOUND)
+    judged = assess(validation.joint, **KNOWN)
     assert judged.keeps_offsets
     text = to_text(render_validation(validation))
     assert "with this backlash" in text

@@ -62,10 +62,11 @@ def test_the_evidence_of_one_parameter_is_its_integral(true, scale, reference):
     covariance = scale**2 * jacobian @ jacobian.T + sigma**2 * np.eye(7)
     found = multivariate_normal(zero, covariance).logpdf(deviation) + gain
 
+    noise, prior = norm(0.0, sigma), norm(reference, scale)
+    share = prior.sf(0.0)
+
     def density(b):
-        noise = norm(0.0, sigma).pdf(readings - jacobian[:, 0] * b).prod()
-        prior = norm(reference, scale)
-        return noise * prior.pdf(b) / prior.sf(0.0)
+        return noise.pdf(readings - jacobian[:, 0] * b).prod() * prior.pdf(b) / share
 
     expected, _ = quad(density, 0.0, 12.0 * scale, epsabs=0.0, epsrel=1e-10, limit=200)
     assert found == pytest.approx(math.log(expected), abs=1e-8)

@@ -128,6 +128,7 @@ CALIBRATED = ("reversed sign", "backlash", "experiment 1 as printed")
 @pytest.fixture(scope="module")
 def cases(cycles, workshop, table1):
     """Sound and spoilt sessions by the names of their cases."""
+    cycles = cycles.select([r for r in cycles.readings if r.cycle <= 2])
     largest, backlash = int(np.abs(cycles.values).argmax()), with_backlash()
     coarse = replace(cycles.gauge, resolution=10e-3)
     return {
@@ -146,7 +147,7 @@ def cases(cycles, workshop, table1):
     }
 
 
-@pytest.mark.parametrize("case", ["sound", "experiment 1 as printed"])
+@pytest.mark.parametrize("case", ["workshop", "experiment 1 as printed"])
 def test_every_command_has_the_same_verdict(cases, case, tmp_path):
     """In the document, as exit code, and by what is exported."""
     session, expected = cases[case], VERDICTS[case]

@@ -41,7 +41,7 @@ def full(session):
 
 @pytest.fixture(scope="module")
 def offsets(session):
-    return calibrate(session, "offsets", profile=[OFFSET])
+    return calibrate(session, "offsets", solver="variable-projection", profile=[OFFSET])
 
 
 def test_priors_of_the_geometry_are_scaled_but_not_those_of_offsets(full):

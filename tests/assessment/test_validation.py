@@ -49,7 +49,7 @@ from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
-from orthocal.calibration.refit import repeat_calibration, repeat_fit
+from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.output.text.summary import result_json
@@ -137,8 +137,9 @@ def test_deviations_with_priors_are_as_large_as_expected(name):
         errors = draw_machine(plan.robot, seed)
         first, second = (simulate_session(plan, errors, seed=seed + k).session for k in (0, 1000))
         found = identified(first, "full")
-        expected = expect_deviations(found, repeat_fit(found, second))
-        refit = repeat_calibration(found, second)
+        fit = repeat_fit(found, second)
+        expected = expect_deviations(found, fit)
+        refit = assemble_calibration(fit, nominal=np.array([p.value for p in found.free]))
         sizes.append((expected.rms, refit.rms_before, expected.largest, refit.largest_before))
     rms, achieved, median, largest = np.array(sizes).T
     ratio = np.sqrt(np.mean(achieved**2) / np.mean(rms**2))
@@ -253,10 +254,9 @@ def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3)
 
 
 def test_repetition_is_unknown_where_the_fit_absorbs_the_shared_lines():
-    session = session_of("workshop")
-    calibration = calibrated("workshop", "full")
-    entered = session.with_controller([e.enter for e in find_entries(calibration)])
-    result = validate_calibration(calibration, simulate_session(entered, {}, seed=3).session)
+    errors, session, calibration = calibrated_machine("workshop", "full", 1)
+    entered = session.with_controller(entered_offsets(calibration))
+    result = validate_calibration(calibration, simulate_session(entered, errors, seed=3).session)
     assert result.repetition.repeats is None
     assert result.repetition.matched == len({(r.setup, r.posture) for r in session.readings})
     (unknown,) = result.assessment.of_kind("repetition unknown")
@@ -370,7 +370,7 @@ def test_the_setup_to_read_again_is_the_one_that_disagrees_with_the_others():
     plan, named, unconfirmed = quick_plan().session, 0, 0
     for seed in range(4):
         errors = draw_machine(plan.robot, seed)
-        calibration = calibrate(simulate_session(plan, errors, seed=seed).session, **UNJUDGED)
+        calibration = identified(simulate_session(plan, errors, seed=seed).session)
         entered = plan.with_controller(entered_offsets(calibration))
         session = simulate_session(entered, errors, seed=seed + 1000).session
         setup = list(session.setups)[seed % len(session.setups)]

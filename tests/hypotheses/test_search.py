@@ -108,12 +108,13 @@ def test_a_reversed_reading_is_named_with_its_line_and_expected_value(cycles, re
 
 
 def test_a_factor_is_named_only_if_the_dial_can_show_the_corrected_readings(cycles):
-    (found,) = anomalies(cycles.with_values(100.0 * cycles.values))  # divisions, of 0.01 mm
+    one = cycles.select([r for r in cycles.readings if r.cycle == 1])
+    (found,) = anomalies(one.with_values(100.0 * one.values))  # divisions, of 0.01 mm
     assert found.kind == "decimal point"
     assert "by 0.01" in found.action
     # a hundredth of these would have been read to a hundredth of a division
-    random = np.random.default_rng(3).uniform(-2e-3, 2e-3, len(cycles.values))
-    found = anomalies(cycles.with_values(np.round(random, 5)))
+    random = np.random.default_rng(3).uniform(-2e-3, 2e-3, len(one.values))
+    found = anomalies(one.with_values(np.round(random, 5)))
     assert "inconsistent readings" in {f.kind for f in found}
 
 

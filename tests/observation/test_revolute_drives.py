@@ -13,7 +13,8 @@ from orthocal import load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
-from orthocal.calibration.refit import repeat_calibration, repeat_fit
+from orthocal.calibration.build_record import assemble_calibration
+from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import SessionError
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
@@ -129,9 +130,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     for seed in range(SEEDS):  # legs that turn by 6 degrees: the mounting of a gauge matters most
         first = simulate_session(before, OFFSETS, seed=seed)
         found = identified(first.session)
-        entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
-        folder = tmp_path / f"b{seed}"
-        plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
+        plan = before.with_controller(np.round([e.enter for e in find_entries(found)], 7))
         second = simulate_session(plan, OFFSETS, seed=seed + 1000)
         if seed < VALIDATED:
             # the same dial in both sessions: at 10 mm its scale matters more than its noise
@@ -143,7 +142,8 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
         chances.append(judge_deviations(found, fit).p_value)
-        achieved = repeat_calibration(found, second.session).rms_before
+        nominal = np.array([p.value for p in found.free])
+        achieved = assemble_calibration(fit, nominal=nominal).rms_before
         sizes.append((expect_deviations(found, fit).rms, achieved))
     # one in a hundred is refused for its deviations
     assert binom.cdf(np.sum(np.array(chances) >= BY_CHANCE), SEEDS, 1 - BY_CHANCE) > 0.01

@@ -11,6 +11,7 @@ from tolerances import KINEMATICS
 
 from orthocal import draw_errors, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError, SessionError
+from orthocal.estimation.problem import build_problem
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
@@ -115,22 +116,23 @@ def test_drawn_errors_have_their_tolerances(orthoglide):
 def test_drawn_errors_share_no_numbers_with_noise_and_sensors(plan):
     """With one seed for all, as in `simulate --draw '*' --seed 2`."""
     fine = plan.with_gauge(replace(plan.gauge, resolution=None, range=None))
-    parameters = [*plan.robot.parameters, *nuisance_parameters(fine).parameters]
-    std = {p.name: p.prior_std for p in parameters}
-    products = []
+    names = list(draw_errors(plan.robot, ["*"], seed=0))
+    problem = build_problem(fine, free=names, prior=True)
+    drawn, sensors, shown = [], [], []
     for seed in range(300):
         errors = draw_errors(plan.robot, ["*"], seed=seed)
         simulated = simulate_session(fine, errors, seed=seed)
         zeros = [simulated.zeros[r.setup] for r in plan.readings]
-        nuisance = np.array(list(simulated.nuisance.values()))
-        noise = simulated.session.values - predict_readings(fine, errors, nuisance=nuisance) - zeros
-        sensors = [value / std[name] for name, value in simulated.nuisance.items()]
-        others = np.concatenate([noise / plan.gauge.sigma, sensors])
-        drawn = np.array([value / std[name] for name, value in errors.items()])
-        assert np.abs(drawn[:, None] - others).min() > 1e-9
-        products.append(np.outer(drawn, others))
-    correlations = np.mean(products, axis=0)
-    assert np.abs(correlations).max() < 6.0 / np.sqrt(len(products))
+        drawn.append([errors[n] for n in names])
+        sensors.append(list(simulated.nuisance.values()))
+        shown.append(simulated.session.values - zeros)
+    theta = np.hstack([drawn, sensors])
+    noise = (shown - problem.simulate(theta)[0]) / plan.gauge.sigma
+    drawn, sensors = np.split(theta / problem.theta_scale, [problem.n_machine], axis=1)
+    others = np.hstack([noise, sensors])
+    assert min(np.abs(d[:, None] - o).min() for d, o in zip(drawn, others, strict=True)) > 1e-9
+    correlations = drawn.T @ others / len(drawn)
+    assert np.abs(correlations).max() < 6.0 / np.sqrt(len(drawn))
 
 
 def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):

@@ -14,6 +14,7 @@ from bounds import rms_band
 from calibrated import identified
 from models import JOINTS
 from planned import FEW, QUICK
+from uncompared import uncompared
 
 from orthocal import (
     Choice,
@@ -158,7 +159,8 @@ def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
     dimensions = Orthoglide(travel=(0.1, 0.42), workspace=((-0.08, 0.08),) * 3)
     robot = make_robot(dimensions, tmp_path / "large")
     choice = Choice("full", tolerances=OFFSETS)
-    plan = plan_readings(robot, choice, equipment=Equipment(**FEW), starts=1)
+    with uncompared():
+        plan = plan_readings(robot, choice, equipment=Equipment(**FEW), starts=1)
     assert plan.forecast.workspace.half_side == pytest.approx(0.08)
     small = ToolForecast(robot, plan.forecast.selection, cube(robot, half_side=0.06))
     assert plan.expected.reported.rms > 1.2 * small.after(plan.session).reported.rms
@@ -261,8 +263,8 @@ def test_the_default_box_is_the_reach_of_the_tool(orthoglide):
 
 
 def test_a_plan_uses_the_available_hours(orthoglide):
-    equipment = Equipment(**FEW)
-    plan = plan_readings(orthoglide, "full", hours=1.0, starts=1, equipment=equipment)
+    with uncompared():
+        plan = plan_readings(orthoglide, "full", hours=1.0, starts=1, equipment=Equipment(**FEW))
     assert 45.0 < plan.minutes <= 60.0
 
 
@@ -321,6 +323,7 @@ def test_the_memory_of_a_plan_is_released_with_it(orthoglide):
     assert [ref for ref in kept if ref() is not None] == []
 
 
+@pytest.mark.usefixtures("without_sensor_gains")
 def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide):
     """The paper's readings differ by more than ±0.4 mm."""
     equipment = Equipment(gauge=Gauge(5e-6, 10e-6, (-4e-4, 4e-4)), **FEW)

@@ -8,6 +8,7 @@ from datetime import timedelta
 import numpy as np
 import pytest
 from commands import run_orthocal
+from uncompared import uncompared
 
 from orthocal import (
     draw_errors,
@@ -49,7 +50,8 @@ def machine(orthoglide):
 def planned(machine):
     """First plan of a machine; its search has fewer candidates and starts than a user's plan."""
     equipment = replace(first_equipment(machine, Equipment()), along=5, across=0.0)
-    return plan_readings(machine, "full", equipment=equipment, starts=1)
+    with uncompared():
+        return plan_readings(machine, "full", equipment=equipment, starts=1)
 
 
 def test_the_first_plan_determines_backlash(planned):
@@ -145,7 +147,8 @@ def test_a_plan_determines_both_parts_of_a_periodic_error(orthoglide):
     robot = replace(orthoglide, declared=replace(orthoglide.declared, effects=keys))
     fine = Gauge(sigma=0.5 * UM, resolution=1.0 * UM, range=(-5.0 * MM, 5.0 * MM))
     equipment = Equipment(gauge=fine, sections=(0.5,), across=0.0)
-    plan = plan_readings(with_effects(robot, ["screw"]), "full", equipment=equipment, starts=1)
+    with uncompared():
+        plan = plan_readings(with_effects(robot, ["screw"]), "full", equipment=equipment, starts=1)
     session, sigma = plan.session, stated_sigma(plan.session.gauge)
     rows = [r.posture for r in session.readings]
     setups = np.array([r.setup for r in session.readings])
@@ -182,7 +185,8 @@ def warming(orthoglide):
     """Plan of two setups on a day that warms by 8 K, a reading each half hour."""
     robot = with_effects(orthoglide, ["thermal", "drift"])
     equipment = replace(FEW, temperatures=(20.0, 28.0), minutes_per_reading=30.0)
-    return plan_readings(robot, "full", equipment=equipment, setups=2, starts=1)
+    with uncompared():
+        return plan_readings(robot, "full", equipment=equipment, setups=2, starts=1)
 
 
 def test_a_constant_temperature_does_not_determine_thermal_expansion(warming):
@@ -201,7 +205,8 @@ def test_a_constant_temperature_does_not_determine_thermal_expansion(warming):
 def test_further_readings_determine_drift(orthoglide):
     """Its limit is that of a line through one posture's readings at three times, with the prior."""
     robot = with_effects(orthoglide, ["thermal", "drift"])
-    plan = plan_readings(robot, "full", equipment=FEW, setups=2, starts=1)
+    with uncompared():
+        plan = plan_readings(robot, "full", equipment=FEW, setups=2, starts=1)
     assert not any(e.determined for e in plan.effects)
     further = {f.limit.effect: f for f in plan.further}
     readings = [r for r in plan.session.readings if r.setup == plan.session.readings[0].setup]
@@ -264,7 +269,8 @@ def test_arrows_show_the_direction_of_joint_coordinates(orthoglide):
 def test_the_command_plans_for_effects(tmp_path):
     quick = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
     words = ["plan", "orthoglide", *quick, "--effects", "backlash,thermal", "--out", "monday"]
-    code, text, _ = run_orthocal(tmp_path, *words, "--temperature", "20:28")
+    with uncompared():
+        code, text, _ = run_orthocal(tmp_path, *words, "--temperature", "20:28")
     assert code == 0
     assert "Backlash of each drive: known to ±" in text
     assert "↑" in text

@@ -123,7 +123,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
         centre, (length, scale) = truth[:, None, len(names) : -2], truth[:, -2:].T[:, :, None]
         return (1.0 + scale) * (np.linalg.norm(balls - centre, axis=2) - RADIUS_MM * MM - length)
 
-    space = cube(orthoglide, points_per_side=5)
+    space = cube(orthoglide, points_per_side=3)
     assert_promises(calibrate_machines(plan, space, count=40, read=read))
 
 

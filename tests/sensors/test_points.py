@@ -133,7 +133,7 @@ def test_a_row_can_state_its_covariance(tmp_path):
 @pytest.mark.slow
 def test_a_tracker_alone_identifies_the_complete_model(tmp_path, orthoglide):
     """Machines with all errors; the readings determine 12 axes of each."""
-    outcome = calibrate_machines(grid(tmp_path), cube(orthoglide, points_per_side=5), count=40)
+    outcome = calibrate_machines(grid(tmp_path), cube(orthoglide, points_per_side=3), count=40)
     assert_promises(outcome)
     assert outcome.predicted < SIGMA
     assert outcome.bound == pytest.approx(outcome.predicted, rel=0.05)

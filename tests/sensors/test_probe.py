@@ -185,7 +185,7 @@ def test_heights_of_printers_with_all_errors(tmp_path, printer):
 def test_tool_errors_and_intervals_of_printers_with_all_errors(tmp_path, printer):
     """The tool error is ten times that of other sensors: a bed does not show the scale."""
     plan = load_plan(bed(tmp_path, printer, rings()))
-    space = cube(plan.robot, points_per_side=5)
+    space = cube(plan.robot, points_per_side=3)
     outcome = calibrate_machines(plan, space, count=45)
     assert_promises(outcome)
     assert outcome.bound == pytest.approx(outcome.predicted, rel=0.05)

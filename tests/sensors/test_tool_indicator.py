@@ -232,7 +232,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
     made = Plan()
     for part in parts:
         getattr(made, part)()
-    space = cube(orthoglide, points_per_side=5)
+    space = cube(orthoglide, points_per_side=3)
     assert_promises(calibrate_machines(made.load(tmp_path), space, count=count))
 
 

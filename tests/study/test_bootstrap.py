@@ -13,6 +13,9 @@ from orthocal.study.runner import run_study
 
 CYCLES = 40
 
+FEWER_CYCLES = 14
+"""Their residuals have as many degrees of freedom as cycles of six setups in all cycles."""
+
 
 @pytest.fixture(scope="module")
 def many_cycles(root, tmp_path_factory):
@@ -26,6 +29,9 @@ def many_cycles(root, tmp_path_factory):
 
 @pytest.mark.parametrize("by", ["residuals", "cycles"])
 def test_scatter_agrees_with_the_covariance(many_cycles, by):
+    if by == "residuals":
+        rows = [r for r in many_cycles.readings if r.cycle <= FEWER_CYCLES]
+        many_cycles = many_cycles.select(rows)
     study = build_bootstrap_study(many_cycles, "offsets", by=by, draws=1000)
     found = summarise_bootstrap(study, run_study(study))
     assert found.fewest_cycles == (CYCLES if by == "cycles" else None)

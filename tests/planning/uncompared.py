@@ -1,0 +1,19 @@
+"""Plans alone: `test_plan.py` and `test_plan_command.py` verify what they are compared with."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, contextmanager
+from unittest.mock import patch
+
+from orthocal.planning import cost_curve
+from orthocal.planning.plan_comparison import Comparison
+
+
+@contextmanager
+def uncompared():
+    """No usual plans, no other gauges, and a curve of one setup."""
+    with ExitStack() as patches:
+        for name in ("list_alternatives", "list_usual_plans"):
+            patches.enter_context(patch.object(Comparison, name, lambda _: ()))
+        patches.enter_context(patch.object(cost_curve, "MAX_SETUPS", 1))
+        yield
