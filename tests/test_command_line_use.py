@@ -1,6 +1,6 @@
 """Complete use of the command line on a machine with legs of 250 mm, up to a better part.
 
-new → record → check → calibrate → enter → record → validate → calibrate → export → LinuxCNC. The
+new → record → check → calibrate → enter → validate → calibrate → export → LinuxCNC. The
 machine is simulated with all errors at their tolerances and realistic gauge misalignment.
 
 With effects beside geometry: new → simulate → check → calibrate → export → again → simulate →
@@ -29,8 +29,10 @@ from orthocal import (
     load_calibration,
     load_plan,
     load_robot,
+    load_session,
     restore_session,
     simulate_session,
+    write_session,
 )
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.observation.simulate import collect_errors
@@ -79,19 +81,9 @@ def two_rounds(tmp_path_factory, short_reports):
     run(folder, "calibrate", "mill/first", "--out", "one")
     one = load_calibration(folder / "one")
     # the same plan with the offsets entered
-    first, second = folder / "mill/first", folder / "mill/second"
-    second.mkdir()
-    entered = ", ".join(f"{e.enter / MM:.3f}" for e in find_entries(one))
-    text = (first / "session.yaml").read_text()
-    assert "offsets_mm: [0.0, 0.0, 0.0]" in text
-    text = text.replace("offsets_mm: [0.0, 0.0, 0.0]", f"offsets_mm: [{entered}]")
-    (second / "session.yaml").write_text(text)
-    head, *lines = [r.split(",") for r in (first / "readings.csv").read_text().splitlines()]
-    for line in lines:
-        line[head.index("reading_mm")] = ""
-    text = "\n".join(",".join(cells) for cells in (head, *lines))
-    (second / "readings.csv").write_text(text + "\n")
-    measure(folder, "mill/second", errors, SEED + 1)
+    entered = np.array([round(e.enter, 6) for e in find_entries(one)])
+    session = load_session(folder / "mill/first").with_controller(entered)
+    write_session(simulate_session(session, errors, seed=SEED + 1).session, folder / "mill/second")
     run(folder, "validate", "one", "mill/second")
     answer = run(folder, "calibrate", "mill/second", "--out", "two")
     return folder, errors, one, load_calibration(folder / "two"), " ".join(answer.split())
@@ -179,9 +171,10 @@ def warming_machine(tmp_path_factory, short_reports):
     folder = tmp_path_factory.mktemp("warming")
     options = DIMENSIONS.replace("--effects none", EFFECTS)
     run(folder, "new", "mill", *options.split())
-    few = "--along", "3", "--sections", "0.5", "--starts", "1", "--temperature", TEMPERATURES[0]
+    day = "--temperature", TEMPERATURES[0]
+    few = "--along 3 --across-mm 0 --sections 0.5 --starts 1".split()
     with no_sensor_gains():
-        run(folder, "plan", "mill", *few, "--out", "mill/both-sides")
+        run(folder, "plan", "mill", *few, *day, "--out", "mill/both-sides")
 
     def identify(name, *sessions):  # without its report
         (folder / name).mkdir()
@@ -190,16 +183,7 @@ def warming_machine(tmp_path_factory, short_reports):
 
     truth = [f"--error={d}_slide.backlash_mm={BACKLASH / MM:g}" for d in "xyz"]
     draw = "--draw", "full", "--seed", SEED, *truth
-    run(
-        folder,
-        "simulate",
-        "mill/both-sides",
-        *draw,
-        "--temperature",
-        TEMPERATURES[0],
-        "--out",
-        "one",
-    )
+    run(folder, "simulate", "mill/both-sides", *draw, *day, "--out", "one")
     run(folder, "check", "one")
     identify("first", "one")
     home = "--offsets", "--home-offset", "0,0,0", "--latched=+,+,+"

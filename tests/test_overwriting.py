@@ -16,15 +16,17 @@ pytestmark = pytest.mark.usefixtures("short_reports")
 MINE = "# my notes about orthocal\n"
 PROGRAM = "G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F300\nM2\n"
 
+QUICK = ("--solver", "linearised")
+
 RESULTS = {
     ("report", "one"): ["report.html"],
     ("sheet", "session", "--out", "out"): ["sheet.html", "01-xy.ngc"],
-    ("calibrate", "session", "--out", "out"): ["calibration.json"],
+    ("calibrate", "session", *QUICK, "--out", "out"): ["calibration.json"],
     ("export", "one", "--to", "yaml", "--out", "out"): ["errors.yaml"],
     ("export", "one", "--to", "table", "--out", "out"): ["corrections.csv"],
     ("export", "one", "--to", "urdf", "--out", "out"): ["orthoglide.urdf", "orthoglide.yaml"],
     ("export", "one", "--to", "linuxcnc", "--out", "out"): ["README.md", "joints.ini"],
-    ("export", "one", "--to", "linuxcnc", "--module", "--out", "out"): [
+    ("export", "one", "--to", "linuxcnc", "--module", "--within", "10", "--out", "out"): [
         *("kinematics.ini", "orthocal_core.c"),
     ],
     ("correct", "one", "program.ngc", "--out", "out/part.ngc"): ["part.ngc"],
@@ -63,9 +65,13 @@ def test_a_result_replaces_its_own_alone(folder, words):
         assert refusal in done.stderr
         assert file.read_text() == MINE
         assert {p.name for p in out.iterdir()} <= {name, "calibration.json"}
-        assert run_orthocal(folder, *words, "--force").returncode == 0
+        file.unlink()
+    for name in names:
+        (out / name).write_text(MINE)
+    assert run_orthocal(folder, *words, "--force").returncode == 0
+    for name in names:
         if name not in ("calibration.json", "report.html"):  # these state times
-            assert file.read_bytes() == written[name]
+            assert (out / name).read_bytes() == written[name]
 
 
 def test_the_exported_robot_does_not_replace_the_nominal_one(folder, root):
@@ -81,7 +87,7 @@ def test_exports_are_marked_once(folder):
     assert run_orthocal(folder, *words).returncode == 0
     session = folder / "session/session.yaml"
     session.write_text(session.read_text().replace("robot: orthoglide", "robot: ../out"))
-    assert run_orthocal(folder, "calibrate", "session", "--out", "one").returncode == 0
+    assert run_orthocal(folder, "calibrate", "session", *QUICK, "--out", "one").returncode == 0
     assert run_orthocal(folder, *words).returncode == 0
     for name in ("orthoglide.urdf", "orthoglide.yaml"):
         assert (folder / "out" / name).read_text().count(WRITTEN) == 1

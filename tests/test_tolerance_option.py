@@ -25,7 +25,7 @@ from orthocal.output.text.answer import calibrate_command
 OF_JOINTS = {"*.[xyz]_mm": 0.02, "*.r?_mrad": 0.2}
 STATED = OF_JOINTS | {"x_slide.offset_mm": 8.0}
 OPTION = [word for key, value in STATED.items() for word in ("--tolerance", f"{key}={value:g}")]
-QUICK = ["--along", 3, "--across-mm", 0, "--setups", 3, "--starts", 1, "--seed", 1]
+QUICK = "--along 3 --across-mm 0 --sections 0.5 --setups 3 --starts 1 --seed 1".split()
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,6 @@ def compared(text):
     "words",
     [
         ["check", "2"],
-        ["calibrate", "2"],
         ["calibrate", "2", "--model", "full", "--solver", "variable-projection"],
         ["compare", "2", "--models", "offsets", "--repeat", "3"],
         ["validate", "calibration", "3"],
@@ -92,6 +91,10 @@ def test_a_calibration_keeps_the_option(folder):
         load_calibration(folder / of / "calibration") for of in ("plain", "stated")
     )
     assert by_option.robot.parameters.stated == by_key.robot.parameters.stated == STATED
+    plain, stated = (
+        (folder / of / "calibration/calibration.json").read_text() for of in ("plain", "stated")
+    )
+    assert compared(plain) == compared(stated)
     assert by_option.assessment.decision.verdict == "reject"
     assert by_option.assessment.of_kind("beyond tolerances")
 
