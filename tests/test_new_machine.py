@@ -40,6 +40,7 @@ SIZES = {
     "--counts": "up,down,up",
     "--at-zero-mm": "0",
 }
+QUICK = ["--solver", "variable-projection"]
 PROGRAMS = [f"{i:02d}-{name}.ngc" for i, name in enumerate("yx zx xy zy xz yz".split(), 1)]
 
 
@@ -186,7 +187,7 @@ def test_what_is_read_on_it_calibrates_it(made, tmp_path):
     error = ["--error", "y_slide.offset_mm=1.5", "--exact"]
     code, _, err = orthocal("simulate", made / "first", "--out", out, *error)
     assert code == 0, err
-    code, text, _ = orthocal("calibrate", out, "--model", "offsets")
+    code, text, _ = orthocal("calibrate", out, "--model", "offsets", *QUICK)
     found = dict(re.findall(r"(?m)^  ([xyz])_slide +\+0\.000 +([-+]\d\.\d+)", text))
     assert {k: float(v) for k, v in found.items()} == pytest.approx(
         {"x": 0.0, "y": 1.5, "z": 0.0}, abs=0.002
@@ -494,7 +495,7 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
 
 
-def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path):
+def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path, without_sensor_gains):
     """The workspace of a linear delta depends on its radius; short slides do not reach it."""
     short = [w.replace("30:560", "200:300") for w in DELTA]
     code, _, err = orthocal("new", tmp_path / "delta", *short)

@@ -321,7 +321,7 @@ def test_a_machine_that_the_firmware_can_express_is_met(calibrated):
     assert np.abs(turned) == pytest.approx([0.7e-3 / 0.1411, 0.0], abs=5e-5)
 
 
-def test_accuracy_of_a_printer_names_no_offsets(calibrated, tmp_path):
+def test_accuracy_of_a_printer_names_no_offsets(calibrated, tmp_path, without_sensor_gains):
     """It has none: its firmware has settings. Names of parameters such as a_slide.offset remain."""
     _, calibration = calibrated
     write_calibration(calibration, tmp_path / "one")

@@ -10,7 +10,15 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from calibrated import EXPERIMENT_2, SOUND, calibrated, rename_setups, scene_of, session_of
+from calibrated import (
+    EXPERIMENT_2,
+    SOUND,
+    UNJUDGED,
+    calibrated,
+    rename_setups,
+    scene_of,
+    session_of,
+)
 from gauges import exact
 from tolerances import KINEMATICS
 
@@ -158,7 +166,7 @@ def test_deviation_is_enlarged_by_the_stated_factor(full):
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines"])
 def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(name):
-    scene = scene_of(name)
+    scene = draw_scene(calibrated(name, **UNJUDGED))
     size = np.ptp(scene.camera.points, axis=0).max()
     fact = next(f for f in scene.facts if "largest" in f)
     largest = float(fact.split("largest ")[1].split(" mm")[0]) * 1e-3
@@ -274,7 +282,7 @@ def test_of_many_gauges_the_overview_names_the_worst(full):
 def test_deviations_of_a_session_are_those_of_its_calibration(name):
     """Two ways to the same numbers: without a fit, and from the residuals of a fit."""
     session = exact(session_of(name))  # without nuisance parameters of the mounting
-    rows = calibrate(session, judgement=SOUND).residuals
+    rows = calibrate(session, **UNJUDGED).residuals
     mean = {}
     for row in rows:
         mean.setdefault((row.setup, row.posture, row.minus), []).append(row.deviation)
