@@ -31,7 +31,7 @@ from orthocal import (
 from orthocal.calibration.machine import Machine
 from orthocal.effects.compliance import GRAVITY
 from orthocal.export.linuxcnc import approximation as approximating
-from orthocal.export.linuxcnc.approximation import _list_temperatures, approximate, check_points
+from orthocal.export.linuxcnc.approximation import approximate, check_points
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.instructions import write_module_page
 
@@ -143,8 +143,10 @@ def test_range_of_use_widens_that_of_the_module(tmp_path):
     (folder / "machine.yaml").write_text(
         text.replace("\n  tcp: ", "\n  use: {temperature_C: [10, 45]}\n  tcp: ")
     )
-    temperatures = [t for t, _ in _list_temperatures(load_robot(folder))]
-    assert (min(temperatures), max(temperatures)) == (7.0, 45.0)
+    change = approximate(
+        machine_of(load_robot(folder), {}), within=1e-6, half_side=0.05
+    ).inverse.thermal
+    assert (change.lowest, change.highest) == (7.0, 45.0)
 
 
 SOFT = "compliance: {rod_N_per_um: 1, platform_kg: 5}"
