@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from calibrated import SOUND
+from calibrated import EXPERIMENT_2, UNJUDGED, calibrated
 from commands import run_orthocal
 from effect_plans import effect_plan
 
@@ -41,8 +41,8 @@ ROUNDED = 0.5e-9 * np.sqrt(3.0) * 1.5
 
 
 @pytest.fixture(scope="module")
-def full(root):
-    return calibrate(load_session(root / "examples/sweep"), "full", judgement=SOUND)
+def full():
+    return calibrated("sweep", "full", **UNJUDGED)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def turned(root):
     truth = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
     session = simulate_session(plan, truth, seed=1).session
     rows = [replace(r, value=-r.value) if r.setup == "zy" else r for r in session.readings]
-    return calibrate(replace(session, readings=tuple(rows)))
+    return calibrate(replace(session, readings=tuple(rows)), solver="variable-projection")
 
 
 def test_corrections_bring_the_tool_to_its_targets(full):
@@ -71,8 +71,9 @@ def test_corrections_bring_the_tool_to_its_targets(full):
     assert np.abs(uncorrected - point).max() > 50e-6
 
 
-def test_corrections_of_offsets_alone_are_zero(experiment_2):
-    text = export_calibration(calibrate(experiment_2, judgement=SOUND), "table")["corrections.csv"]
+def test_corrections_of_offsets_alone_are_zero():
+    found = calibrated(EXPERIMENT_2, **UNJUDGED)
+    text = export_calibration(found, "table")["corrections.csv"]
     assert {r[f"d{k}_mm"] for r in csv.DictReader(io.StringIO(text)) for k in "xyz"} == {"0.000000"}
 
 
@@ -201,9 +202,9 @@ def test_a_corrected_program_is_marked_and_not_corrected_again(full, tmp_path):
     assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
 
 
-def test_unknown_format_is_refused(experiment_2):
+def test_unknown_format_is_refused():
     with pytest.raises(ParameterError, match="found 'xml'; expected one of yaml, table"):
-        export_calibration(calibrate(experiment_2, judgement=SOUND), "xml")
+        export_calibration(calibrated(EXPERIMENT_2, **UNJUDGED), "xml")
 
 
 def written(files, folder):
@@ -228,7 +229,7 @@ def test_urdf_is_the_calibrated_machine(full, tmp_path):
 def test_errors_of_effects_are_beside_the_urdf():
     truth = {"x_slide.offset": 1e-3, "x_slide.backlash": 40e-6, "z_slide.backlash": 25e-6}
     session = simulate_session(effect_plan("backlash"), truth, seed=1, sigma=3e-6).session
-    calibration = calibrate(session, "offsets", solver="variable-projection", judgement=SOUND)
+    calibration = calibrate(session, "offsets", **UNJUDGED)
     files = export_calibration(calibration, "urdf", anyway=True)
     rows = list(csv.DictReader(io.StringIO(files["effects.csv"])))
     expected = {n: v for n, v in calibration.errors.items() if n.endswith("backlash") and v}
@@ -314,9 +315,8 @@ OTHERS = """\
 """Elements named joint that are not joints of the robot."""
 
 
-def test_offset_displaces_the_origin_of_its_drive(root, tmp_path):
-    session = load_session(root / "examples/table1/experiment-2")
-    calibration = calibrate(session, judgement=SOUND)
+def test_offset_displaces_the_origin_of_its_drive(tmp_path):
+    calibration = calibrated(EXPERIMENT_2, **UNJUDGED)
     files = export_calibration(calibration, "urdf")
     assert set(files) == {"orthoglide.urdf", "orthoglide.yaml"}
     robot = load_robot(written(files, tmp_path / "real"))

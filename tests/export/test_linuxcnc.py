@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from calibrated import SOUND
+from calibrated import UNJUDGED
 from commands import run_orthocal
 from linuxcnc import (
     Joint,
@@ -103,7 +103,7 @@ def calibrated(root, folder, example, truth, model, *, active=ACTIVE):
     plan.write_text(text)
     loaded = load_plan(plan)
     errors = load_errors(truth, loaded.robot) if not isinstance(truth, dict) else truth
-    return calibrate(simulate_session(loaded, errors, exact=True).session, model, judgement=SOUND)
+    return calibrate(simulate_session(loaded, errors, exact=True).session, model, **UNJUDGED)
 
 
 @pytest.fixture(scope="module")

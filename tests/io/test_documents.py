@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 
 import pytest
+from calibrated import EXPERIMENT_2, UNJUDGED, calibrated
 
 from orthocal import Choice, calibrate, load_calibration, load_session
 from orthocal.assessment.controller_entries import find_entries
@@ -95,8 +96,8 @@ def test_control_characters_are_refused(where, text, refused):
 
 
 @pytest.fixture(scope="module")
-def document(experiment_2):
-    return calibration_document(calibrate(experiment_2))
+def document():
+    return calibration_document(calibrated(EXPERIMENT_2))
 
 
 def change(document, keys, value):
@@ -170,9 +171,9 @@ def test_a_calibration_without_free_parameters_is_refused(document, tmp_path):
         ("raw-cycles", "full"),
     ],
 )
-def test_a_written_calibration_reads_the_same(model, name, root, tmp_path):
+def test_a_written_calibration_reads_the_same(model, name, tmp_path):
     """18 readings beside 126 errors leave a hundredth of a degree of freedom, for example."""
-    calibration = calibrate(root / "examples" / name, model)
+    calibration = calibrated(name, model)
     found = load_calibration(write_calibration(calibration, tmp_path / "calibration.json"))
     assert calibration_document(found) == calibration_document(calibration)
 
@@ -201,11 +202,11 @@ def test_an_implausible_estimate_is_refused(raw_cycles, monkeypatch):
 
     monkeypatch.setattr(module, "_estimates", absurd)
     with pytest.raises(SolverError, match=r"the result is implausible \(x_slide.offset is 2.6e"):
-        calibrate(raw_cycles)
+        calibrate(raw_cycles, **UNJUDGED)
 
 
-def test_a_result_that_could_not_be_loaded_is_not_written(experiment_2, tmp_path):
-    result = calibrate(experiment_2)
+def test_a_result_that_could_not_be_loaded_is_not_written(tmp_path):
+    result = calibrated(EXPERIMENT_2)
     absurd = replace(result, model_covariance=1e12 * result.model_covariance)
     with pytest.raises(SolverError, match=r"the result is implausible \(calibration.json: "):
         write_calibration(absurd, tmp_path / "calibration.json")

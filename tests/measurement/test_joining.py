@@ -168,6 +168,7 @@ def test_both_solvers_weigh_gauges_alike(root):
     pair = [
         simulate_session(plan, TRUTH, seed=i, sigma=s).session for i, s in enumerate((2e-5, 5e-6))
     ]
+    pair = [replace(s, readings=tuple(r for r in s.readings if r.cycle == 1)) for s in pair]
     problem = build_problem(join_sessions(pair), model="lengths")
     problem = problem.with_noise_ratio(np.repeat([1.0, 0.25], problem.observations.size // 2))
     for loss, hessian in (("squares", "gauss-newton"), ("huber", "exact")):
