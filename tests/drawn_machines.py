@@ -23,7 +23,8 @@ class DrawnMachines:
         self.machine = build_problem(plan, free=machine_errors(robot), prior=True)
         self.is_offset = np.array([n.endswith(".offset") for n in self.machine.free])
         self.prior_stds = np.array([p.prior_std for p in self.machine.parameters])
-        problem = build_problem(plan, model=model)
+        exact = plan.with_values(np.zeros(len(plan.readings)))
+        problem = build_problem(exact, model=model)
         # the same optimum as Ipopt's (`test_solvers`), in less time
         self.nominal = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
         self.problem, self.others = problem, find_unmodelled_errors(self.nominal)

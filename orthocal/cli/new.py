@@ -538,7 +538,7 @@ def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
 
     try:
         session = orthocal.load_plan(sheet.parent)
-        if any(r.value for r in session.readings):
+        if any(r.is_read for r in session.readings):
             put_note(
                 f"orthocal: {sheet.parent}: has readings, which belong to the dimensions at that "
                 "time; its sheet is unchanged"

@@ -381,9 +381,10 @@ class Session:
         """Table of the setups and their readings for a notebook."""
         rows = []
         for setup in self.setups.values():
-            values = [r.value / MM for r in self.readings if r.setup == setup.name]
+            readings = [r for r in self.readings if r.setup == setup.name]
+            values = [r.value / MM for r in readings if r.is_read]
             extremes = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
-            rows.append((setup.name, setup.sensor.describe(), str(len(values)), *extremes))
+            rows.append((setup.name, setup.sensor.describe(), str(len(readings)), *extremes))
         kind = "differences" if self.only_differences else "readings"
         summary = f"{len(self.readings)} {kind} in {len(self.postures)} postures"
         headers = ("setup", "sensor", kind, "smallest [mm]", "largest [mm]")
