@@ -319,7 +319,7 @@ def _describe_detectable(session: Session) -> Finding:
     detectable = detectable_changes(session)
     for drive in session.robot.drives:
         size = detectable.get(drive.name, math.inf)
-        if math.isinf(size):
+        if not size < drive.upper - drive.lower:
             undetectable.append(drive.name)
             continue
         p = session.robot.parameters[f"{drive.name}.offset"]

@@ -18,6 +18,7 @@ from orthocal import (
     simulate_session,
     write_session,
 )
+from orthocal.assessment import judgement
 from orthocal.hypotheses.families.sessions import changes_between_sessions, detectable_changes
 from orthocal.hypotheses.hypothesis_set import explain_with_amounts
 from orthocal.hypotheses.linear_model import LinearModel
@@ -107,6 +108,17 @@ def test_without_a_change_the_detectable_size_is_stated(days):
     assert 0.03 < finding.numbers["seen_from_mm"] < 0.12
     alone = check_session(load_session(days / "monday"))
     assert not alone.of_kind("no change", "change unknown", "machine changed")
+
+
+def test_changes_beyond_the_travel_are_not_said_to_be_detectable(days, monkeypatch):
+    sessions = join_sessions([load_session(days / n) for n in ("monday", "tuesday")])
+    changes = {"x_slide": 200.0, "y_slide": 0.4e-3, "z_slide": 0.3e-3}
+    monkeypatch.setattr(judgement, "detectable_changes", lambda _: changes)
+    (finding,) = check_session(sessions).of_kind("no change")
+    assert finding.numbers == {"seen_from_mm": pytest.approx(0.4)}
+    assert "A change of x_slide would not have been" in finding.text
+    monkeypatch.setattr(judgement, "detectable_changes", lambda _: dict.fromkeys(changes, 200.0))
+    assert check_session(sessions).of_kind("change unknown")
 
 
 def test_changes_above_the_stated_limit_are_found_and_small_ones_are_not(plan):

@@ -119,7 +119,8 @@ class NonlinearProgram(Program):
         It shares the compiled functions.
         """
         other = super().with_problem(problem)
-        other.__dict__.pop("_exact", None)
+        if "_exact" in self.__dict__:
+            other.__dict__["_exact"] = self._exact.with_problem(problem)
         return other
 
     def _solve(self, data: SolverInput) -> Solution:

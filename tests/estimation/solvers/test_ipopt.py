@@ -264,3 +264,17 @@ def test_options_reach_ipopt(experiment_2):
         NonlinearProgram(problem, options=SolverOptions(ipopt={"max_iter": 1})).solve(sigma=1e-5)
     with pytest.raises(ValueError, match="ipopt has"):
         SolverOptions(ipopt={"tol": None})
+
+
+def test_programs_of_other_noise_share_the_exact_hessian(experiment_2):
+    problem = build_problem(experiment_2, model="offsets")
+    program = NonlinearProgram(problem)
+    built = program._exact
+    louder = problem.with_noise_ratio(2.0 * problem.noise_ratio)
+    other = program.with_problem(louder)._exact
+    assert other._functions is built._functions
+    assert other.problem is louder
+    fresh = NonlinearProgram(louder, options=SolverOptions(hessian="exact"))
+    found, expected = (p.solve(sigma=1e-5) for p in (other, fresh))
+    assert found.objective == pytest.approx(expected.objective, rel=1e-9)
+    assert found.objective == pytest.approx(built.solve(sigma=2e-5).objective, rel=1e-9)
