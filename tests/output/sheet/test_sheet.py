@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import permutations
 
@@ -336,6 +337,17 @@ PAGE_HEIGHT = (297.0 - 2.0 * 12.0) / 25.4 * 96.0
 """Height of an A4 page within the sheet's margins, [px]."""
 
 
+@contextmanager
+def printed_sheet(plan, folder):
+    """The sheet of a plan in a browser, as it is printed on A4."""
+    path = folder / "sheet.html"
+    path.write_text(sheet_files(plan)["sheet.html"])
+    with open_browser() as browser, visit(browser, path.as_uri()) as found:
+        found.page.set_viewport_size({"width": round(PRINTED), "height": 1000})
+        found.page.emulate_media(media="print")
+        yield found.page
+
+
 @pytest.mark.parametrize("effects", [(), ("backlash", "thermal", "drift")])
 def test_tables_of_readings_are_as_wide_as_the_text(small, effects, tmp_path):
     """With columns for approach, temperature and time, and for what a perfect machine shows."""
@@ -346,12 +358,8 @@ def test_tables_of_readings_are_as_wide_as_the_text(small, effects, tmp_path):
             for i, r in enumerate(plan.readings)
         ]
         plan = replace(plan, readings=tuple(readings))
-    path = tmp_path / "sheet.html"
-    path.write_text(sheet_files(plan)["sheet.html"])
-    with open_browser() as browser, visit(browser, path.as_uri()) as found:
-        found.page.set_viewport_size({"width": round(PRINTED), "height": 1000})
-        found.page.emulate_media(media="print")
-        widths = found.page.evaluate(
+    with printed_sheet(plan, tmp_path) as page:
+        widths = page.evaluate(
             """() => [...document.querySelectorAll('table')].map((table) =>
                  [table.getBoundingClientRect().right, table.rows[0].cells.length])"""
         )
@@ -379,12 +387,8 @@ def test_a_setup_of_ten_readings_fits_on_a_page(tmp_path):
     plan = load_plan(tmp_path / "plan.yaml").with_effects(["backlash"])
     approached = [replace(r, conditions=Conditions(approach="pnp")) for r in plan.readings]
     plan = replace(plan, readings=tuple(approached))
-    path = tmp_path / "sheet.html"
-    path.write_text(sheet_files(plan)["sheet.html"])
-    with open_browser() as browser, visit(browser, path.as_uri()) as found:
-        found.page.set_viewport_size({"width": round(PRINTED), "height": 1000})
-        found.page.emulate_media(media="print")
-        front, *heights = found.page.evaluate(
+    with printed_sheet(plan, tmp_path) as page:
+        front, *heights = page.evaluate(
             """() => {
                  const boxes = [...document.querySelectorAll('section[id]')].map(
                      (section) => section.getBoundingClientRect());
