@@ -275,7 +275,7 @@ def _prepare(
     region, words = _find_region(result)
     lags = _find_lags(result)
     by_program = options.backlash is Backlash.PROGRAM and bool(lags.any())
-    sides = ApproachSides(result.robot, lags) if by_program else None
+    sides = ApproachSides(result, values, lags) if by_program else None
     return _Correction(
         result=result,
         controller=controller,

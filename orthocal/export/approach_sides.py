@@ -1,9 +1,10 @@
 """Commanded points with backlash taken up, for a controller that does not compensate it.
 
 Corrected points hold for the middle of both sides of the backlash. To reach such a point from one
-side, the drives must move farther by their lags d. To first order the commanded point changes by
-J d, with the Jacobian J of the nominal forward kinematics. The second order is below 0.01 µm for a
-backlash of 0.1 mm.
+side, the screws of the drives must move farther by their lags. The drives then move by d, which
+differs from the lags by the slope of the screws' periodic errors. To first order the commanded
+point changes by J d, with the Jacobian J of the nominal forward kinematics. The second order is
+below 0.01 µm for a backlash of 0.1 mm.
 """
 
 from __future__ import annotations
@@ -13,8 +14,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
-from orthocal.export.linuxcnc.drive_compensation import without_periodic_errors
+from orthocal.export.linuxcnc.drive_compensation import (
+    find_periodic_errors,
+    without_periodic_errors,
+)
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, find_nominal_form
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.continuation import Failures
@@ -58,14 +63,19 @@ class ApproachSides:
     """Sides of the drives of a machine along a program; see `orthocal.gcode.reversals.Sides`.
 
     Args:
-        robot: The robot.
+        calibration: The calibration.
+        offsets: Offsets in the controller, shape (n_drives,), [m, rad].
         lags: Lag of each drive on one side, shape (n_drives,), [m, rad].
     """
 
-    def __init__(self, robot: Robot, lags: Array) -> None:
+    def __init__(self, calibration: Calibration, offsets: Array, lags: Array) -> None:
+        robot = calibration.robot
         self.last = np.zeros(len(robot.drives))
         self._axes = np.array(require_commanded_tool(robot))
         self._lags = lags
+        self._offsets = offsets
+        self._displacement = calibration.displacement
+        self._periodic = find_periodic_errors(robot, calibration.errors)
         self._closure = nominal_closure(robot)
         middle = tool_at_zero(robot)
         half = np.full(middle.size, IDENTIFICATION_REGION * robot.characteristic_length)
@@ -95,6 +105,23 @@ class ApproachSides:
         inverse_jacobian = np.stack(columns, axis=-1)
         if not np.isfinite(inverse_jacobian).all():
             raise ClosureError("is at the border of the workspace", posture="a point")
-        shifts = np.linalg.solve(inverse_jacobian, (sides[shifted] * self._lags)[..., None])
+        moves = self._moves(self.drives(base), sides[shifted] * self._lags)
+        shifts = np.linalg.solve(inverse_jacobian, moves[..., None])
         commanded[np.ix_(shifted, self._axes)] += shifts[..., 0]
         return commanded
+
+    def _moves(self, drives: Array, lags: Array) -> Array:
+        """Changes of the drives that move their screws by lags, shape (k, n_drives), [m, rad].
+
+        Args:
+            drives: Nominal drive coordinates, shape (k, n_drives), [m, rad].
+            lags: Lags of the drives, shape (k, n_drives), [m, rad].
+        """
+        if self._periodic is None:
+            return lags
+        motors = drives + self._displacement(drives)
+        screws = motors - self._offsets
+        lagging = self._periodic.invert(screws + self._periodic(screws) + lags)
+        motors += lagging - screws
+        moved = motors - self._displacement(drives + lags)
+        return np.asarray(motors - self._displacement(moved) - drives)

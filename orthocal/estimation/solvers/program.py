@@ -115,6 +115,7 @@ class Program(ABC):
                 directions. False for start values on the better sides.
 
         Raises:
+            ValueError: If a reading is missing, as in a plan, or their number is wrong.
             SolverError: If the solver does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
         """
@@ -122,7 +123,7 @@ class Program(ABC):
         return self._solve(
             SolverInput(
                 sigma=sigma,
-                values=np.asarray(problem.values if values is None else values, dtype=np.float64),
+                values=self._readings(problem.values if values is None else values),
                 weights=self._weights(excluded),
                 start=np.array(problem.active_theta if start is None else start, dtype=np.float64),
                 start_passive=start_passive,
@@ -130,6 +131,24 @@ class Program(ABC):
                 mirrored=mirrored,
             )
         )
+
+    def _readings(self, values: ArrayLike) -> Array:
+        """Readings of the entries, shape (n_entries,), [m of the first gauge].
+
+        Raises:
+            ValueError: If a reading is missing, or their number is wrong.
+        """
+        readings = np.asarray(values, dtype=np.float64)
+        shape = (self.problem.observations.size,)
+        if readings.shape != shape:
+            raise ValueError(f"values: found the shape {readings.shape}; expected {shape}")
+        missing = int((~np.isfinite(readings)).sum())
+        if missing:
+            raise ValueError(
+                f"values: {missing} of {readings.size} readings have no value; expected readings "
+                "in m. A plan has none until it is measured or simulated"
+            )
+        return readings
 
     def _weights(self, excluded: ArrayLike | None) -> Array:
         """Weights of the entries, shape (n_entries,): 1, or `EXCLUDED_WEIGHT` for excluded ones."""

@@ -229,6 +229,18 @@ def test_no_convergence_is_an_error():
         VariableProjection(problem, options=SolverOptions(max_iterations=1)).solve(sigma=5e-6)
 
 
+@pytest.mark.parametrize("solver", ["ipopt", "linearised", "variable-projection"])
+def test_readings_without_a_value_are_refused(solver):
+    problem = problem_of("table1/experiment-1-printed", "offsets", "plain")
+    program = build_program(problem, SolverOptions(solver=solver))
+    values = np.array(problem.values)
+    with pytest.raises(ValueError, match=r"values: found the shape \(5,\); expected \(12,\)"):
+        program.solve(sigma=1e-5, values=values[:5])
+    values[[1, 4]] = np.nan
+    with pytest.raises(ValueError, match="values: 2 of 12 readings have no value"):
+        program.solve(sigma=1e-5, values=values)
+
+
 def test_a_start_at_which_the_tip_misses_the_rod_is_refused():
     problem = problem_of("workshop", "offsets", "plain")
     start = np.zeros(problem.n_free)
