@@ -47,7 +47,15 @@ MAX_LAST_STEP = 1e-6
 """Longer steps from closed loops are caused by nearly singular postures, [m or rad]."""
 
 MAX_NEWTON_STEPS = 30
-MAX_STEP_REDUCTIONS = 6
+MAX_STEP_REDUCTIONS = 3
+UNTESTED_STEPS = 4
+"""Newton steps without a test of `MAX_REMAINING`."""
+
+MAX_REMAINING = 0.5
+"""Largest residual after a Newton step, relative to that before. Beyond it a posture is abandoned:
+it is out of reach, or it is approached in shorter steps. Near a singular posture the ratio is 1/4.
+"""
+
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
 LARGEST_CONTINUATION_MOVE = 0.3
 """Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
@@ -370,9 +378,10 @@ class _Path:
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
         active = np.flatnonzero(worst >= tolerance)
-        for _ in range(MAX_NEWTON_STEPS):
+        for count in range(1, MAX_NEWTON_STEPS + 1):
             if not active.size:
                 break
+            before = worst.copy()
             step = system.step(residuals[active], jacobians[active])
             usable = np.isfinite(step).all(axis=1)
             rows, step = active[usable], step[usable]
@@ -389,7 +398,8 @@ class _Path:
                 if not rows.size:
                     break
             active = np.sort(np.concatenate(improved))
-            active = active[worst[active] >= tolerance]
+            limit = before[active] * (MAX_REMAINING if count > UNTESTED_STEPS else 1.0)
+            active = active[(worst[active] >= tolerance) & (worst[active] < limit)]
         regular = np.zeros(len(x), dtype=np.bool_)
         closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
         if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is known

@@ -600,7 +600,9 @@ def test_points_on_a_side_of_the_backlash(calibration):
     lags = find_lags(calibration.robot, calibration.errors)
     middle = field.exactly(points)[0]
     commanded = ApproachSides(calibration, ACTIVE, lags).command(middle, sides)
-    screws = screws_of(calibration, Machine(load_robot("orthoglide"), {}).inverse(commanded) - ACTIVE)
+    screws = screws_of(
+        calibration, Machine(load_robot("orthoglide"), {}).inverse(commanded) - ACTIVE
+    )
     tool = tool_of(calibration, screws - 0.5 * sides * backlash_of(calibration))
     assert np.abs(tool - points).max() < SECOND_ORDER
 

@@ -143,6 +143,19 @@ def test_the_solution_at_points_is_that_of_the_machine_and_its_conditions(orthog
     assert np.abs(nominal_drives - first[:, 3:]).max() < CLOSED_FORM
 
 
+def test_a_posture_out_of_reach_is_abandoned_early(orthoglide, monkeypatch):
+    """Newton steps that do not reduce the residual are not repeated: 227 evaluations with them."""
+    closure = LoopClosure(orthoglide)
+    evaluate, calls = closure._closing.evaluate, []
+    monkeypatch.setattr(
+        closure._closing, "evaluate", lambda x, *rest: calls.append(x) or evaluate(x, *rest)
+    )
+    failures = {}
+    closure.close(orthoglide.drive_zero + [[0.3, 0.0, 0.0]], failures=failures)
+    assert list(failures) == [0]
+    assert len(calls) < 150
+
+
 def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
     joints = np.array([[0.31025] * 3, [0.7, 0.3, 0.3]])
     with pytest.raises(ClosureError, match="posture 'far' cannot be reached") as caught:
