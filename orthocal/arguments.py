@@ -61,8 +61,16 @@ def require_numbers(values: object, *, argument: str, counts: tuple[int, ...] = 
             raise TypeError(f"{argument}: found {name!r}: {value!r}; expected a name and {kinds}")
 
 
-def require_array(values: object, *, shape: tuple[int, ...], argument: str) -> NDArray[np.float64]:
+def require_array(
+    values: object, *, shape: tuple[int, ...], argument: str, missing: bool = False
+) -> NDArray[np.float64]:
     """A new array of finite real numbers of a given shape.
+
+    Args:
+        values: The argument.
+        shape: Its shape.
+        argument: Its name.
+        missing: Whether NaN is allowed.
 
     Raises:
         TypeError: If the values are not real numbers.
@@ -77,10 +85,9 @@ def require_array(values: object, *, shape: tuple[int, ...], argument: str) -> N
         raise TypeError(f"{argument}: found a {kind}; expected real numbers") from None
     if result.shape != shape:
         raise ValueError(f"{argument}: found the shape {result.shape}; expected {shape}")
-    if not np.isfinite(result).all():
-        raise ValueError(
-            f"{argument}: found {result[~np.isfinite(result)][0]}; expected finite numbers"
-        )
+    wrong = np.isinf(result) if missing else ~np.isfinite(result)
+    if wrong.any():
+        raise ValueError(f"{argument}: found {result[wrong][0]}; expected finite numbers")
     return result
 
 

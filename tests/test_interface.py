@@ -32,6 +32,7 @@ from orthocal import (
 from orthocal.assessment.tool_error import Workspace
 from orthocal.calibration.file import write_calibration
 from orthocal.errors import OrthocalError, ParameterError
+from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
 
 
@@ -153,6 +154,8 @@ def test_arguments_of_calibrate(arguments, message, experiment_2):
         {"closure_tolerance": float("nan")},
         {"max_iterations": "a"},
         {"max_iterations": -1},
+        {"max_iterations": True},
+        {"tolerance": True},
         {"max_iterations": 2_000_000},
         {"print_level": 1.5},
         {"print_level": 13},
@@ -163,6 +166,23 @@ def test_arguments_of_calibrate(arguments, message, experiment_2):
 def test_options_of_the_solver(options):
     with pytest.raises((TypeError, ValueError), match="expected"):
         SolverOptions(**options)
+
+
+def test_options_are_copied_and_numbers_of_any_type():
+    ipopt = {"mu_strategy": "adaptive"}
+    options = SolverOptions(max_iterations=np.int64(7), tolerance=np.float32(0.5), ipopt=ipopt)
+    ipopt["mu_strategy"] = "monotone"
+    assert options.ipopt == {"mu_strategy": "adaptive"}
+
+
+def test_arrays_of_results_are_read_only(calibration, experiment_2):
+    problem = build_problem(experiment_2)
+    for array in (
+        *(problem.active_theta, problem.theta_scale, problem.prior_precision),
+        *(problem.zero_incidence, calibration.identifiability.singular_values),
+    ):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 1.0
 
 
 SHAPES = [5, None, [1, 2], [[1, 2]], np.zeros((2, 2, 3)), [], "abc", {}, [1j, 0, 0], [["a"] * 3]]

@@ -22,7 +22,7 @@ from orthocal.assessment.controller_entries import (
     lowers,
 )
 from orthocal.assessment.fit_findings import find_fit_findings
-from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
+from orthocal.assessment.judgement import Judgement, judgement_of, rank, verdict_of
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.assessment.wording import describe_actions
@@ -105,12 +105,11 @@ def calibrate(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
-    judgements = [] if judgement is None else [judgement]
+    judged: list[Judgement] = []
 
     def find_scale(session: Session) -> ToleranceScale:
-        if not judgements:
-            judgements.append(judge_session(session))
-        return judgements[0].tolerance_scale
+        judged.append(judgement_of(session, judgement))
+        return judged[0].tolerance_scale
 
     calibration, session = identify(
         sessions,
@@ -121,7 +120,7 @@ def calibrate(
         start=start,
         find_scale=find_scale,
     )
-    return replace(calibration, assessment=assess(calibration, session, judgement=judgements[0]))
+    return replace(calibration, assessment=assess(calibration, session, judgement=judged[0]))
 
 
 def assess(
@@ -145,8 +144,7 @@ def assess(
     """
     require_calibration(calibration)
     session_used = session or restore_session(calibration)
-    if judgement is None:
-        judgement = judge_session(session_used)
+    judgement = judgement_of(session_used, judgement)
     chosen = _choose_values(calibration)
     entries, tool, keep = chosen.entries, chosen.tool, chosen.keep
     firmware = calibration.session.firmware is not None  # settings are written, no offsets entered
@@ -212,7 +210,7 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
     if missing:
         require_read(session, partial=True)
         session = session.select([r for r in session.readings if r.is_read])
-    judgement = judgement or judge_session(session)
+    judgement = judgement_of(session, judgement)
     findings = rank([*judgement.findings, *missing])
     if judgement.verdict == "enter":
         within = judgement.tolerance_scale.factor == 1.0

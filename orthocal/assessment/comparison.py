@@ -11,7 +11,7 @@ from typing import Any, get_args
 from orthocal.arguments import require_names
 from orthocal.assessment.assess import assess
 from orthocal.assessment.effect_comparison import EffectComparison, compare_effects
-from orthocal.assessment.judgement import Judgement, judge_session, rank
+from orthocal.assessment.judgement import Judgement, judgement_of, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
@@ -145,7 +145,7 @@ def compare_models(
     names, noise = _require_models(session, models), find_known_noise(session)
     if judgement is None:
         report("searching the readings for anomalies")
-        judgement = judge_session(session)
+    judgement = judgement_of(session, judgement)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     results, undetermined = _score_models(build, names, noise.sigma, options, report)
     if judgement.verdict != "enter":

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.effect_separability import find_unshown_effects
 from orthocal.assessment.plausibility import (
@@ -37,6 +38,7 @@ from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.hypotheses.search import find_anomalies, find_suspected_rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.robot.parameters import Parameter
+from orthocal.session.completeness import require_complete
 from orthocal.session.session import Session
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import estimate_repeatability
@@ -77,11 +79,38 @@ class Judgement:
     """Findings, the gravest first."""
     tolerance_scale: ToleranceScale
     """Factor by which the machine's errors exceed their tolerances; 1 if they do not."""
+    values: Array | None = None
+    """Readings that were judged, shape (n_readings,), [m]; None for any readings."""
 
     @property
     def verdict(self) -> Verdict:
         """Verdict of the gravest finding."""
         return verdict_of(self.findings)
+
+    def require_of(self, session: Session) -> None:
+        """Refuse to use the judgement for other readings.
+
+        Raises:
+            ValueError: If the session has other readings.
+        """
+        values = self.values
+        if values is not None and not np.array_equal(values, session.values, equal_nan=True):
+            raise ValueError("judgement: found one of other readings; expected that of the session")
+
+
+def judgement_of(session: Session, judgement: Judgement | None) -> Judgement:
+    """Judgement of a session: the one that was computed already, or a new one.
+
+    Raises:
+        TypeError: If the argument is of another kind.
+        ValueError: If the judgement is of other readings.
+        OrthocalError: As for `judge_session`.
+    """
+    if judgement is None:
+        return judge_session(session)
+    require_kind(judgement, Judgement, expected="a Judgement, as judge_session returns")
+    judgement.require_of(session)
+    return judgement
 
 
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
@@ -108,9 +137,10 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     Raises:
         ClosureError: If the machine cannot reach a posture.
         RobotError: If the closures of the robot depend on each other.
-        SessionError: If the session cannot be calibrated; see `Session.require_complete`.
+        SessionError: If the session cannot be calibrated; see `require_complete`.
     """
-    session.require_complete()
+    require_kind(session, Session, expected="a Session, as load_session returns")
+    require_complete(session)
     mistakes = _find_mistakes(session, anomalies)
     implausible = find_implausible(session, explained=bool(mistakes))
     if any(f.kind == "wrong dimensions" for f in implausible):
@@ -129,6 +159,7 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     return Judgement(
         rank([*implausible, *mistakes, *order, *no_change, *scale_findings, *unshown_effects]),
         scale,
+        session.values,
     )
 
 

@@ -25,6 +25,7 @@ from orthocal.estimation.weighting import first_sigma, split_by_gauge, with_init
 from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.observation.observations import require_conditions
+from orthocal.session.completeness import require_complete
 from orthocal.session.session import Session
 from orthocal.statistics.identifiability import find_base_parameters
 
@@ -73,7 +74,7 @@ def identify(
     if isinstance(choice, Choice):
         gathered = [choice.applied_to(one) for one in gathered]
     session = join_sessions(gathered)
-    session.require_complete()
+    require_complete(session)
     require_names(profile, argument="profile")
     chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)

@@ -41,14 +41,12 @@ def load_each_once(
         SessionError: If two sessions are the same, or have the same readings, or nearly so.
         ParameterError: If an effect does not exist, or a tolerance is invalid.
     """
+    from orthocal.measurement.joining import require_another
+
     sessions: list[orthocal.Session] = []
     for path in paths:
         session = orthocal.load_session(path, partial=partial)
-        if any(session.was_read_from(other.sha256) for other in sessions):
-            raise SessionError(
-                "is the same session as one before it; its readings would count twice",
-                where=str(path),
-            )
+        require_another(session, sessions)
         for other in sessions:
             _require_measured_again(session, other)
         sessions.append(session)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 from typing import Literal, get_args
 
 from orthocal.arguments import require_kind
@@ -69,12 +70,15 @@ class SolverOptions:
         require_kind(self.loss, Loss, expected="Loss(...)")
         for name in ("tolerance", "closure_tolerance"):
             value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0.0 < value < math.inf):
+            if isinstance(value, bool) or not (
+                isinstance(value, Real) and 0.0 < float(value) < math.inf
+            ):
                 raise ValueError(f"{name} is {value!r}; expected a number above 0")
         limits = {"max_iterations": LARGEST_MAX_ITERATIONS, "print_level": LARGEST_PRINT_LEVEL}
         for name, largest in limits.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and 0 <= value <= largest):
+            is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+            if not (is_whole and 0 <= value <= largest):
                 problem = f"{name} is {value!r}; expected a whole number from 0 to {largest}"
                 raise ValueError(problem)
         if not isinstance(self.ipopt, Mapping):
@@ -84,6 +88,7 @@ class SolverOptions:
                 raise ValueError(
                     f"ipopt has {key!r}: {option!r}; expected a name and a number, text or bool"
                 )
+        object.__setattr__(self, "ipopt", dict(self.ipopt))
         _require_one_of(self.hessian, get_args(Hessian), "Hessian", ValueError)
         _require_one_of(self.solver, get_args(SolverKind), "solver", OrthocalError)
 

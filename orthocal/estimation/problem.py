@@ -27,6 +27,7 @@ from orthocal.estimation.mirrored_starts import (
 )
 from orthocal.estimation.selection import KnownWithStd, Selection, select_parameters
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
+from orthocal.io.fields import read_only
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -100,9 +101,9 @@ class CalibrationProblem:
         self.observations: Observations = build_observations(session)
         self.noise_ratio = np.ones(self.observations.size) if noise_ratio is None else noise_ratio
         self.states = self.observations.states
-        self.theta_scale = selection.prior_stds
-        self.prior_precision = selection.prior.astype(np.float64)
-        self.prior_mean = np.where(selection.prior, selection.mean, 0.0)
+        self.theta_scale = read_only(selection.prior_stds)
+        self.prior_precision = read_only(selection.prior)
+        self.prior_mean = read_only(np.where(selection.prior, selection.mean, 0.0))
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
 
     def with_values(self, values: ArrayLike) -> CalibrationProblem:
@@ -157,7 +158,7 @@ class CalibrationProblem:
         All other parameters are 0. The values are clipped to the bounds. They are the point of
         linearisation and the default start values.
         """
-        return self._theta_at(self.session.active_offsets)
+        return read_only(self._theta_at(self.session.active_offsets))
 
     def _theta_at(self, offsets: Array) -> Array:
         """Free parameters of the nominal machine with offsets, within their bounds, (n_free,)."""
@@ -204,7 +205,7 @@ class CalibrationProblem:
         """Incidence matrix of entries and gauge zeros, shape (n_entries, n_zeros)."""
         result = np.zeros((self.observations.size, self.observations.n_zeros))
         result[np.arange(self.observations.size), self.observations.zero] = 1.0
-        return result
+        return read_only(result)
 
     @cached_property
     def closure(self) -> LoopClosure:

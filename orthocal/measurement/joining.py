@@ -55,10 +55,17 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             returned unchanged.
 
     Raises:
-        SessionError: If there is no session, or if robots, effects, firmware or tolerances differ.
+        SessionError: If there is no session, if two are the same, or if robots, effects, firmware
+            or tolerances differ.
+        TypeError: If an argument has another type.
     """
+    require_kind(sessions, (list, tuple), expected="a list of Sessions, as load_session returns")
+    for session in sessions:
+        require_kind(session, Session, expected="a Session, as load_session returns")
     if not sessions:
         raise SessionError("there is no session to join")
+    for i, session in enumerate(sessions):
+        require_another(session, sessions[:i])
     if len(sessions) == 1:
         return sessions[0]
     if settings := sessions[0].firmware:
@@ -86,6 +93,19 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         joined=True,
         purpose=purposes.pop() if len(purposes) == 1 else None,
     )
+
+
+def require_another(session: Session, sessions: Sequence[Session]) -> None:
+    """Refuse a session that is one of those before it.
+
+    Raises:
+        SessionError: If it is.
+    """
+    if any(session is other or session.was_read_from(other.sha256) for other in sessions):
+        raise SessionError(
+            "is the same session as one before it; its readings would count twice",
+            where=str(session.path or "session"),
+        )
 
 
 def on_one_printer(sessions: Sequence[Session], robot: Robot, homed: ArrayLike) -> list[Session]:

@@ -8,6 +8,7 @@ order. Setups on one square block share its roll, up to the squareness of the bl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -62,7 +63,11 @@ class MountingKeys(Keys):
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Mounting uncertainty of a gauge: prior standard deviation of each parameter."""
+    """Mounting uncertainty of a gauge: prior standard deviation of each parameter.
+
+    Raises:
+        ValueError: If a standard deviation is negative, or not a number.
+    """
 
     direction: float = DIRECTION_STD
     """Roll and pitch, [rad]."""
@@ -76,6 +81,12 @@ class Mounting:
     """Name of the square block."""
     square: float = SQUARE_STD
     """Squareness of the block, [rad]."""
+
+    def __post_init__(self) -> None:
+        for name in ("direction", "section", "lateral", "scale", "square"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name}: found {value!r}; expected 0 or a positive number")
 
     @staticmethod
     def from_keys(keys: Any) -> Mounting:  # noqa: ANN401 - of any setup with MountingKeys

@@ -15,6 +15,7 @@ reading h, and touches the rod on the side of d. Its tip is at c + h d.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -105,7 +106,11 @@ class TipKeys(Keys):
 
 @dataclass(frozen=True, slots=True)
 class Tip:
-    """Tip of a plunger."""
+    """Tip of a plunger.
+
+    Raises:
+        ValueError: If the form is unknown, or a size is negative.
+    """
 
     form: Literal["ball", "blade"]
     radius: float
@@ -116,6 +121,11 @@ class Tip:
     def __post_init__(self) -> None:
         if self.form not in ("ball", "blade"):
             raise ValueError(f"form: found {self.form!r}; expected 'ball' or 'blade'")
+        for name, value in (("radius", self.radius), ("width", self.width)):
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name}: found {value!r}; expected 0 or more, in m")
+        if self.form == "ball" and self.radius == 0.0:
+            raise ValueError("radius: found 0; expected that of the ball, in m")
 
     @staticmethod
     def from_keys(keys: TipKeys) -> Tip:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,15 +28,11 @@ from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import GaugeZero, Sensor, is_difference
-from orthocal.text import list_some
 from orthocal.units import MM
 
 DISTANCE_DECIMALS = 9
 """Decimals in m and rad to which distances from the mechanical zero are compared."""
 
-
-MOST_NAMED = 8
-"""Largest number of names in a message."""
 
 PostureForm = Literal["tcp", "joints"]
 """Kind of the commanded coordinates: of the tool centre point or of the drives."""
@@ -486,43 +482,19 @@ class Session:
         """
         return replace(self, robot=with_effects(self.robot, names))
 
-    def require_complete(self) -> None:
-        """Refuse a session that was made in Python and cannot be calibrated.
-
-        Raises:
-            SessionError: If a sensor does not fit the robot, or a reading names an unknown setup or
-                posture or has no value.
-        """
-        for name, setup in self.setups.items():
-            setup.sensor.require_fit(self.robot, where=f"setups.{name}")
-        for r in self.readings:
-            if r.setup not in self.setups:
-                _refuse_name(r.setup, "setup", self.setups)
-            for posture in (r.posture, *([] if r.minus is None else [r.minus])):
-                if posture not in self.postures:
-                    _refuse_name(posture, "posture", self.postures)
-        missing = sum(not r.is_read for r in self.readings)
-        if missing:
-            count = len(self.readings)
-            raise SessionError(
-                f"{missing} of {count} readings have no value; expected readings, in m",
-                where="readings",
-            )
-
     def with_values(self, values: Sequence[float] | Array) -> Session:
         """Session with other readings.
 
         Args:
-            values: Readings, shape (n_readings,), [m].
+            values: Readings, shape (n_readings,), [m]; NaN for readings without a value.
+
+        Raises:
+            TypeError: If the values are not real numbers.
+            ValueError: If their number differs, or one is infinite.
         """
-        value_array = require_array(values, shape=(len(self.readings),), argument="values")
+        shape = (len(self.readings),)
+        value_array = require_array(values, shape=shape, argument="values", missing=True)
         readings = tuple(
             replace(r, value=float(v)) for r, v in zip(self.readings, value_array, strict=True)
         )
         return replace(self, readings=readings, sha256="")
-
-
-def _refuse_name(name: str, noun: str, known: Mapping[str, object]) -> NoReturn:
-    """Refuse an unknown setup or posture of a reading."""
-    listed = list_some(list(known), MOST_NAMED)
-    raise SessionError(f"'{name}' is not a {noun}; {noun}s: {listed}", where="readings")

@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from orthocal.arrays import Array
 from orthocal.io.documents import Count, Number
-from orthocal.io.fields import CLOSED, Many, Vector
+from orthocal.io.fields import CLOSED, Many, Vector, read_only
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
@@ -155,7 +155,7 @@ def analyse_identifiability(
     names = [p.name for p in parameters]
     resolvable = information.determined(sigma=threshold if sigma > 0.0 else np.nan)
     return Identifiability(
-        singular_values=s,
+        singular_values=read_only(s),
         threshold=threshold,
         rank=int((s > threshold).sum()),
         structural_rank=information.rank,

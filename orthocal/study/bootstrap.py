@@ -8,13 +8,13 @@ estimates, not their total uncertainty.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
@@ -120,11 +120,17 @@ def build_bootstrap_study(
         seed: Seed of the draws.
 
     Raises:
+        ParameterError: If `by` is unknown, or there is no draw.
         SessionError: If there is nothing to resample.
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
+    if by not in get_args(Resampled):
+        expected = " or ".join(get_args(Resampled))
+        raise ParameterError(f"found {by!r}; expected {expected}", where="by")
+    if draws < 1:
+        raise ParameterError(f"found {draws}; expected at least 1", where="draws")
     study = BootstrapStudy(session, resolve_choice(choice, session), by, draws, seed)
     prepare_once(study)  # refuses a session that cannot be resampled
     return study

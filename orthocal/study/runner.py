@@ -68,7 +68,7 @@ class StudyTable:
 def run_study(
     study: Study,
     *,
-    folder: Path | None = None,
+    folder: Path | str | None = None,
     workers: int = 1,
     dask: str | None = None,
     anew: bool = False,
@@ -87,7 +87,7 @@ def run_study(
     Raises:
         OrthocalError: If the directory belongs to another study, or the scheduler does not answer.
     """
-    path = None if folder is None else folder / JOURNAL
+    path = None if folder is None else Path(folder) / JOURNAL
     sizes = study.task_sizes
     total = sum(sizes)
     with open_results(path, study, anew=anew) as (results, store):

@@ -151,7 +151,7 @@ def test_a_posture_out_of_reach_is_abandoned_early(orthoglide, monkeypatch):
         closure._closing, "evaluate", lambda x, *rest: calls.append(x) or evaluate(x, *rest)
     )
     failures = {}
-    closure.close(orthoglide.drive_zero + [[0.3, 0.0, 0.0]], failures=failures)
+    closure.close(orthoglide.drive_zero[None] + [0.3, 0.0, 0.0], failures=failures)
     assert list(failures) == [0]
     assert len(calls) < 150
 

@@ -7,7 +7,7 @@ import pytest
 from gauges import exact
 
 from orthocal import load_plan, load_session, simulate_session
-from orthocal.errors import SessionError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.study.bootstrap import build_bootstrap_study, find_cycles, summarise_bootstrap
 from orthocal.study.runner import run_study
 
@@ -83,3 +83,9 @@ def test_cycles_with_different_postures(raw_cycles):
     short = replace(raw_cycles, readings=raw_cycles.readings[1:])
     with pytest.raises(SessionError, match="has cycles with different postures"):
         build_bootstrap_study(short, by="cycles")
+
+
+@pytest.mark.parametrize(("argument", "value"), [("by", "cycle"), ("draws", 0)])
+def test_arguments_without_a_meaning_are_refused(raw_cycles, argument, value):
+    with pytest.raises(ParameterError, match=f"{argument}: found {value!r}; expected"):
+        build_bootstrap_study(raw_cycles, "offsets", **{argument: value})

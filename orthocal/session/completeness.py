@@ -1,0 +1,151 @@
+"""Checks of sessions that are made in Python; those in files are checked as they are read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from numbers import Real
+from typing import NoReturn, get_args
+
+import numpy as np
+
+from orthocal.effects.adjustment import require_adjustment
+from orthocal.errors import SessionError
+from orthocal.kinematics.conditions import find_approach_problem
+from orthocal.sensors.protocol import GaugeZero
+from orthocal.session.session import Gauge, Posture, Reading, ReadingKey, Session, Setup
+from orthocal.text import list_some
+
+MOST_NAMED = 8
+"""Largest number of names in a message."""
+
+
+def require_complete(session: Session) -> None:
+    """Refuse a session that cannot be calibrated.
+
+    Raises:
+        SessionError: If a part is of another kind, a sensor does not fit the robot, a reading has
+            no value or repeats another one, or a name is unknown.
+    """
+    _require_named(session.postures, Posture, "postures")
+    _require_named(session.setups, Setup, "setups")
+    for name, gauge in session.gauges.items():
+        _require_kind(gauge, Gauge, f"gauges.{name}")
+    _require_offsets(session, session.controller_offsets, "controller_offsets")
+    _require_adjustments(session, session.adjusted, "adjusted")
+    for setup in session.setups.values():
+        _require_setup(session, setup)
+    _require_readings(session)
+
+
+def _require_named(parts: object, kind: type, where: str) -> None:
+    """Refuse parts that are not a mapping from their names.
+
+    Raises:
+        SessionError: If they are not.
+    """
+    if not isinstance(parts, Mapping):
+        raise SessionError(
+            f"found a {type(parts).__name__}; expected a mapping of names", where=where
+        )
+    for name, part in parts.items():
+        _require_kind(part, kind, f"{where}.{name}")
+        if part.name != name:
+            raise SessionError(f"has the name '{part.name}'", where=f"{where}.{name}")
+
+
+def _require_kind(value: object, kind: type, where: str) -> None:
+    if not isinstance(value, kind):
+        found, expected = type(value).__name__, kind.__name__
+        raise SessionError(f"found a {found}; expected a {expected}", where=where)
+
+
+def _require_offsets(session: Session, offsets: object, where: str) -> None:
+    """Refuse active offsets that are not one number for each drive; None if not stated."""
+    count = len(session.robot.drives)
+    if offsets is None or (
+        isinstance(offsets, np.ndarray) and offsets.shape == (count,) and np.isfinite(offsets).all()
+    ):
+        return
+    raise SessionError(
+        f"found {offsets!r}; expected an array of {count} numbers, in m or rad", where=where
+    )
+
+
+def _require_adjustments(session: Session, adjusted: Mapping[str, float], where: str) -> None:
+    for name in adjusted:
+        require_adjustment(session.robot, name, where=where, error=SessionError)
+
+
+def _require_setup(session: Session, setup: Setup) -> None:
+    """Refuse a setup that does not fit its session.
+
+    Raises:
+        SessionError: If a part of it is invalid; names the key.
+    """
+    where = f"setups.{setup.name}"
+    if not hasattr(setup.sensor, "require_fit"):
+        raise SessionError(f"found {setup.sensor!r}; expected a sensor", where=f"{where}.sensor")
+    setup.sensor.require_fit(session.robot, where=where)
+    if setup.gauge not in session.gauges:
+        _refuse_name(setup.gauge, "gauge", session.gauges, where=where)
+    if setup.aligned_at is not None and setup.aligned_at not in session.postures:
+        _refuse_name(setup.aligned_at, "posture", session.postures, where=f"{where}.aligned_at")
+    if setup.zero not in get_args(GaugeZero):
+        expected = " or ".join(get_args(GaugeZero))
+        raise SessionError(f"found {setup.zero!r}; expected {expected}", where=f"{where}.zero")
+    if not 0.0 <= setup.payload < math.inf:
+        raise SessionError(
+            f"found {setup.payload}; expected 0 or a positive number, in kg",
+            where=f"{where}.payload",
+        )
+    _require_offsets(session, setup.active, f"{where}.active")
+    _require_adjustments(session, setup.adjusted or {}, f"{where}.adjusted")
+
+
+def _require_readings(session: Session) -> None:
+    """Refuse readings without a value, of unknown names, or of the same place and cycle.
+
+    Raises:
+        SessionError: If there are such readings, or none.
+    """
+    if not session.readings:
+        raise SessionError("there are none; expected at least one", where="readings")
+    keys = set[ReadingKey]()
+    for r in session.readings:
+        _require_kind(r, Reading, "readings")
+        if r.setup not in session.setups:
+            _refuse_name(r.setup, "setup", session.setups, where="readings")
+        for posture in (r.posture, *([] if r.minus is None else [r.minus])):
+            if posture not in session.postures:
+                _refuse_name(posture, "posture", session.postures, where="readings")
+        if not isinstance(r.value, Real) or math.isinf(r.value):
+            raise SessionError(
+                f"found {r.value!r}; expected a finite number, in m", where=session.where(r)
+            )
+        if r.cycle < 1:
+            raise SessionError(
+                f"found the cycle {r.cycle}; expected at least 1", where=session.where(r)
+            )
+        approach = None if r.conditions is None else r.conditions.approach
+        if approach is not None and (problem := find_approach_problem(approach, session.robot)):
+            raise SessionError(f"approach: found {problem}", where=session.where(r))
+        if r.key in keys:
+            raise SessionError(
+                f"repeats cycle {r.cycle}; count the repetitions: cycle 1, 2, …",
+                where=session.where(r),
+            )
+        keys.add(r.key)
+    missing = sum(not r.is_read for r in session.readings)
+    if missing:
+        count = len(session.readings)
+        raise SessionError(
+            f"{missing} of {count} readings have no value; expected readings, in m",
+            where="readings",
+        )
+
+
+def _refuse_name(name: str, noun: str, known: Mapping[str, object], *, where: str) -> NoReturn:
+    """Refuse an unknown name of a setup, a posture or a gauge."""
+    listed = list_some(list(known), MOST_NAMED)
+    raise SessionError(f"'{name}' is not a {noun}; {noun}s: {listed}", where=where)

@@ -1,0 +1,105 @@
+"""Sessions that are made in Python are checked before they are calibrated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibrated import session_of
+
+from orthocal import Conditions, Mounting, Tip, calibrate, join_sessions, judge_session
+from orthocal.errors import SessionError
+from orthocal.session.completeness import require_complete
+
+
+@pytest.fixture(scope="module")
+def session():
+    return session_of("raw-cycles")
+
+
+def first_reading(session, **changes):
+    """Session whose first reading is changed."""
+    return replace(
+        session, readings=(replace(session.readings[0], **changes), *session.readings[1:])
+    )
+
+
+def first_setup(session, **changes):
+    """Session whose first setup is changed."""
+    name, setup = next(iter(session.setups.items()))
+    return replace(session, setups={**session.setups, name: replace(setup, **changes)})
+
+
+WRONG = {
+    "no reading": (lambda s: replace(s, readings=()), "readings", "there are none"),
+    "missing": (lambda s: first_reading(s, value=np.nan), "readings", "1 of 54 readings have no"),
+    "infinite": (lambda s: first_reading(s, value=np.inf), "csv:2", "found inf"),
+    "text": (lambda s: first_reading(s, value="1"), "csv:2", "found '1'"),
+    "cycle": (lambda s: first_reading(s, cycle=0), "csv:2", "found the cycle 0"),
+    "repeated": (lambda s: first_reading(s, cycle=2), "csv", "repeats cycle 2"),
+    "setup": (lambda s: first_reading(s, setup="xx"), "readings", "'xx' is not a setup"),
+    "posture": (lambda s: first_reading(s, posture="p"), "readings", "'p' is not a posture"),
+    "approach": (
+        lambda s: first_reading(s, conditions=Conditions(approach="pp")),
+        "csv:2",
+        "approach: found 'pp'; expected 3 letters",
+    ),
+    "offsets": (
+        lambda s: replace(s, controller_offsets=[0.0, 0.0, 0.0]),
+        "controller_offsets",
+        "expected an array of 3 numbers",
+    ),
+    "active": (lambda s: first_setup(s, active=np.zeros(2)), ".active", "expected an array of 3"),
+    "gauges": (lambda s: replace(s, gauges={}), "setups.", "'' is not a gauge"),
+    "gauge": (lambda s: s.with_gauge(None), "gauges.", "expected a Gauge"),
+    "zero": (lambda s: first_setup(s, zero="fixed"), ".zero", "expected free or known"),
+    "aligned": (lambda s: first_setup(s, aligned_at="p"), ".aligned_at", "'p' is not a posture"),
+    "payload": (lambda s: first_setup(s, payload=-1.0), ".payload", "found -1.0"),
+    "sensor": (lambda s: first_setup(s, sensor=None), ".sensor", "expected a sensor"),
+    "name": (lambda s: first_setup(s, name="xx"), "setups.", "has the name 'xx'"),
+    "adjusted": (lambda s: replace(s, adjusted={"a": 1e-3}), "adjusted", "'a' is not an adjust"),
+    "list": (lambda s: replace(s, postures=[*s.postures.values()]), "postures", "found a list"),
+}
+
+
+@pytest.mark.parametrize(("change", "place", "problem"), WRONG.values(), ids=WRONG)
+def test_a_session_that_cannot_be_calibrated_is_refused(session, change, place, problem):
+    require_complete(session)
+    with pytest.raises(SessionError, match=problem) as caught:
+        require_complete(change(session))
+    assert place in str(caught.value)
+
+
+def test_sizes_of_tips_and_mountings_are_not_negative():
+    for size in (-2e-3, 0.0, np.nan):
+        with pytest.raises(ValueError, match="radius: found"):
+            Tip("ball", size)
+    for size in (-1e-3, np.nan):
+        with pytest.raises(ValueError, match="direction: found"):
+            Mounting(direction=size)
+
+
+def test_readings_do_not_count_twice(session):
+    for both in ([session, session], [session, replace(session, title="copy")]):
+        with pytest.raises(SessionError, match="is the same session as one before it"):
+            join_sessions(both)
+
+
+def test_a_judgement_is_used_for_its_readings_only(session):
+    judgement = judge_session(session)
+    other = session.with_values(session.values + 1e-6)
+    with pytest.raises(ValueError, match="judgement: found one of other readings"):
+        calibrate(other, judgement=judgement)
+    with pytest.raises(TypeError, match="found a int; expected a Judgement"):
+        calibrate(session, judgement=3)
+    with pytest.raises(TypeError, match="found a str; expected a Session"):
+        judge_session("raw-cycles")
+
+
+def test_readings_of_an_array_may_be_missing(session):
+    values = np.full(len(session.readings), np.nan)
+    assert not any(r.is_read for r in session.with_values(values).readings)
+    values[3] = np.inf
+    with pytest.raises(ValueError, match="values: found inf"):
+        session.with_values(values)
