@@ -527,7 +527,9 @@ def test_sessions_with_the_same_readings_are_refused(days, tmp_path):
     monday, tuesday = days[0] / "monday", days[0] / "tuesday"
     code, out, err = orthocal("calibrate", monday, tuesday, monday)
     assert (code, out) == (2, "")
-    assert "monday: is the same session as one before it; its readings would count twice" in err
+    assert (
+        "monday/session.yaml: is the same session as one before it; its readings would count" in err
+    )
     copy = shutil.copytree(monday, tmp_path / "copy")
     with (copy / "session.yaml").open("a") as stream:
         stream.write("# Tuesday\n")

@@ -61,7 +61,8 @@ def export(
     Args:
         to (FORMAT): yaml: parameters with their units; table: corrections of the tool over a grid;
             urdf: the calibrated machine as a robot directory; linuxcnc: HOME_OFFSET, or a
-            kinematics module if the calibration identified more than offsets.
+            kinematics module if the calibration identified more than offsets; klipper, marlin,
+            marlin1 or reprapfirmware: settings of a delta printer.
         module: linuxcnc: write a module, or HOME_OFFSET only; default: by what was identified.
         within (UM): linuxcnc: largest error of the module itself at the tool, µm; default: 0.1.
         home_offset (VALUES): linuxcnc: HOME_OFFSET of each joint during the measurement, separated

@@ -6,10 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 import orthocal
+from orthocal.arrays import Array
 from orthocal.cli.options import state_tolerances
 from orthocal.errors import SessionError
 from orthocal.text import spans
+
+ROUNDING = 1e-9
+"""Rounding error of readings, and of travels that follow from other settings, [m]."""
 
 FEWEST_DIFFERENT = 4
 """Fewest different values with which equal readings show that a session is a copy."""
@@ -116,11 +122,11 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
     Raises:
         SessionError: If it is a copy; names both sessions and the lines that differ.
     """
-    values = {r.key: r.value for r in other.readings if r.is_read}
+    values = {r.key: _measured(other, r) for r in other.readings if r.is_read}
     common = [r for r in session.readings if r.is_read and r.key in values]
-    equal = [r for r in common if r.value == values[r.key]]
+    equal = [r for r in common if np.allclose(_measured(session, r), values[r.key], 0.0, ROUNDING)]
     complete = len(equal) == len(session.readings) == len(other.readings)
-    if len({r.value for r in equal}) < FEWEST_DIFFERENT or not (
+    if len({tuple(values[r.key].tolist()) for r in equal}) < FEWEST_DIFFERENT or not (
         complete or _are_copied(session, common, equal)
     ):
         return
@@ -130,6 +136,18 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
         f"has the same readings as {other.path}{exception}: a copy that was not measured again?",
         where=str(session.readings_path or session.path),
     )
+
+
+def _measured(session: orthocal.Session, reading: orthocal.Reading) -> Array:
+    """Numbers that a measurement determines: the reading, and the postures of a printer's log.
+
+    Those are the travels of the carriages below their endstops, which no setting changes.
+    """
+    if session.firmware is None:
+        return np.array([reading.value])
+    postures = [p for p in (reading.posture, reading.minus) if p is not None]
+    travels = [session.firmware.homed - session.postures[p].drives for p in postures]
+    return np.concatenate([[reading.value], *travels])
 
 
 def _are_copied(

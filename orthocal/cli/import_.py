@@ -62,7 +62,17 @@ def import_(
         settings (FILE): Settings that a log lacks, such as printer.cfg, config.g or bed.g.
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
-    if format or settings or radius_mm is not None or _is_printer_log(table, session):
+    if format or settings or radius_mm is not None or _is_printer_log(table):
+        _refuse_options(
+            sheet=sheet,
+            decimal=decimal,
+            separator=separator,
+            unit=unit,
+            encoding=encoding,
+            column=column,
+            fill=fill,
+            replace=replace,
+        )
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
     _require_session(table, session)
@@ -99,11 +109,23 @@ def _show(result: orthocal.TableImport, *, dry_run: bool, json: bool) -> None:
         put_note("Nothing written: the session already has all readings")
 
 
-def _is_printer_log(table: Path, session: Path) -> bool:
-    """True if there is no session to import into, and the file is clearly a printer's log."""
+def _refuse_options(**values: object) -> None:
+    """Refuse options of tables for the log of a printer.
+
+    Raises:
+        SessionError: If one has a value; names it.
+    """
+    for name, value in values.items():
+        if value:
+            problem = "is for tables; found the log of a printer"
+            raise SessionError(problem, where=f"--{name}")
+
+
+def _is_printer_log(table: Path) -> bool:
+    """True if the file is clearly a printer's log."""
     from orthocal.measurement.importing.printer_log import recognise_log
 
-    return not exists(_session_file(session)) and recognise_log(table) is not None
+    return recognise_log(table) is not None
 
 
 def _session_file(session: Path) -> Path:

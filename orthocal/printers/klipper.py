@@ -17,7 +17,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
-from orthocal.printers.klipper_print import Distances, read_analysis, saved_distances
+from orthocal.printers.klipper_print import Distances, has_analysis, read_analysis, saved_distances
 from orthocal.printers.log import (
     NUMBER,
     LogText,
@@ -30,6 +30,7 @@ from orthocal.printers.log import (
     unusual_content,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
+from orthocal.text import shorten
 from orthocal.units import DEG, MM
 
 DECIMALS = 6
@@ -53,6 +54,7 @@ _RUN = re.compile(
     r"Initial delta_calibrate parameters: (?P<parameters>\{.*\})"
 )
 _OLD_PROBE = re.compile(rf"probe at ({NUMBER}),({NUMBER}) is z=({NUMBER})")
+_ANY_PROBE = re.compile(r"probe:? at [^\n]{0,60} (?:is|bed will contact at) z=[^\n]{0,40}")
 _NEW_PROBE = re.compile(rf"probe: at ({NUMBER}),({NUMBER}) bed will contact at z=({NUMBER})")
 
 
@@ -84,7 +86,11 @@ def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
 def _read_heights(source: LogText) -> PrinterLog:
     """Settings, triggers and saved distances.
 
-    Heights that a file with settings saved count only if the log has none: they are older.
+    Heights that were saved in the log count if no line of the probe follows them. Those of a file
+    with settings count only for distances of a print, in a log without heights.
+
+    Raises:
+        SessionError: If a line of the probe is damaged, or there are too few points.
     """
     text, where = source.text, source.name
     sections = _sections(text)
@@ -94,20 +100,45 @@ def _read_heights(source: LogText) -> PrinterLog:
     matches = sorted(
         [*_OLD_PROBE.finditer(text), *_NEW_PROBE.finditer(text)], key=lambda m: m.start()
     )
-    saved = (_sections(text[source.begin :]) if matches else sections).get("delta_calibrate", {})
+    _require_points(source)
+    begin = 0 if has_analysis(source) and not matches else source.begin
+    saved = _sections(text[begin:]).get("delta_calibrate", {})
     steps = _saved_heights(saved, where)
-    if steps is not None:
+    is_newer = bool(matches) and text.rfind("height0_pos") < matches[-1].start()
+    notes = (
+        [f"{len(steps[0])} saved heights are not used: they are older."]
+        if (steps is not None and is_newer)
+        else []
+    )
+    if steps is not None and not is_newer:
         settings = _settings(sections, probe, where)
         return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
     settings = _settings(sections, probe, where)
     points = np.array([_probed(m, source) for m in matches]).reshape(-1, 3) * MM
     contacts = [m.re is _NEW_PROBE for m in matches]  # newer versions print the point of contact
     points -= np.outer(contacts, settings.probe)
-    used, notes = last_probing(points, [m.start() for m in matches], source)
+    used, of_probings = last_probing(points, [m.start() for m in matches], source)
+    notes += of_probings
     name, keys = _probe_section(sections)
     if "z_offset" not in keys:
         notes.append(unstated_trigger(f"z_offset in [{name}]"))
     return probed_log(settings, points[used], where=where, expected=EXPECTED, notes=notes)
+
+
+def _require_points(source: LogText) -> None:
+    """Refuse lines of the probe without three numbers.
+
+    Raises:
+        SessionError: If there is one; names its line.
+    """
+    for line in _ANY_PROBE.finditer(source.text, source.begin):
+        if _OLD_PROBE.match(line[0]) or _NEW_PROBE.match(line[0]):
+            continue
+        raise SessionError(
+            f"found '{shorten(line[0])}'; expected numbers with a decimal point, such as "
+            "'probe at 10.0,20.0 is z=1.25'",
+            where=source.place(line.start()),
+        )
 
 
 def _probed(match: re.Match[str], source: LogText) -> list[float]:

@@ -51,6 +51,11 @@ _COMMAND = re.compile(r"^[^\n;#]*\bDELTA_ANALYZE\b([^\n;#]*)", re.MULTILINE | re
 _WORD = re.compile(r"\b([A-Z_]+)\s*=\s*(\[[^\]]*\]|[^\s=]*)", re.IGNORECASE)
 
 
+def has_analysis(source: LogText) -> bool:
+    """True if the log itself, not a file with settings, has a command `DELTA_ANALYZE`."""
+    return _COMMAND.search(source.text, source.begin) is not None
+
+
 def read_analysis(source: LogText, settings: DeltaSettings) -> tuple[PrintedDistance, ...]:
     """Distances of the commands `DELTA_ANALYZE` in a text; later values replace earlier ones.
 

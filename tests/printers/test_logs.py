@@ -230,6 +230,16 @@ RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
             "log.txt:",
             "decimal comma",
         ),
+        (
+            write_settings("klipper", nominal()) + "probe at 0,000,0,000 is z=0,634\n",
+            "log.txt:",
+            "with a decimal point",
+        ),
+        (
+            write_settings("klipper", nominal()) + "probe: at 0.0,0.0 bed will contact at z=\n",
+            "log.txt:",
+            "contact at z='",
+        ),
         (RRF.replace("G30 P3", "G30 P2"), "log.txt:", "4 heights of 3 points"),
         (RRF.replace("heights: 0.0000", "heights: failed"), "log.txt:", "failed"),
     ],
@@ -303,6 +313,50 @@ def test_settings_may_come_from_another_file(tmp_path):
     result = import_printer_log(log, settings=[tmp_path / "printer.cfg"])
     write_printer_import(result, tmp_path / "bed")
     assert load_session(tmp_path / "bed").firmware.rods == pytest.approx((0.28, 0.2804, 0.2797))
+
+
+def test_heights_of_a_file_with_settings_are_not_those_of_a_log(tmp_path):
+    """A printer.cfg keeps the heights of an earlier probing."""
+    (tmp_path / "printer.cfg").write_text(KLIPPER)
+    (tmp_path / "console.txt").write_text("ok\n")
+    with pytest.raises(SessionError, match="found no probed points"):
+        import_printer_log(tmp_path / "console.txt", settings=[tmp_path / "printer.cfg"])
+
+
+def test_the_later_heights_count(probed):
+    """Klippy.log begins with the configuration and its saved heights."""
+    lines = "".join(f"probe at {x:.3f},{y:.3f} is z=0.1\n" for x, y in rings())
+    after, before = probed(KLIPPER + lines), probed(lines + KLIPPER)
+    assert len(after.carriages) == 41
+    assert after.notes == ("4 saved heights are not used: they are older.",)
+    assert len(before.carriages) == 4
+
+
+def test_saved_heights_with_entered_settings_are_a_copy(tmp_path):
+    """The travels are the same, although all settings differ."""
+    log = write_log("klipper", odd(), rings(), 0.1 * np.sin(rings()[:, 0]), -1.0)
+    (tmp_path / "old.cfg").write_text(log)
+    (tmp_path / "new.cfg").write_text(
+        log.replace(write_settings("klipper", odd()), write_settings("klipper", nominal()))
+    )
+    for name in ("old", "new"):
+        assert run_orthocal(tmp_path, "import", f"{name}.cfg", name).returncode == 0
+    done = run_orthocal(tmp_path, "calibrate", "old", "new")
+    assert done.returncode == 2
+    assert "new/readings.csv: has the same readings as old/session.yaml" in done.stderr
+    one, other = (load_session(tmp_path / name) for name in ("old", "new"))
+    assert one.firmware.homed != other.firmware.homed
+
+
+def test_options_of_tables_are_refused_for_a_log(tmp_path):
+    (tmp_path / "printer.cfg").write_text(KLIPPER)
+    done = run_orthocal(tmp_path, "import", "printer.cfg", "bed", "--unit", "inch")
+    assert done.returncode == 2
+    assert "--unit: is for tables; found the log of a printer" in done.stderr
+    for code in (0, 2):  # not into a session that exists, as if it were a table
+        done = run_orthocal(tmp_path, "import", "printer.cfg", "bed")
+        assert done.returncode == code
+    assert "exists already; choose another directory" in done.stderr
 
 
 def test_what_two_readers_of_a_setting_disagree_about_is_refused(probed):
