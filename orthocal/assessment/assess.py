@@ -314,7 +314,7 @@ def _no_change_needed(entries: Sequence[ControllerEntry], best: ToolErrorSummary
 
 
 def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -> list[Finding]:
-    """Finding that the settings of a firmware are kept, if others are hardly better."""
+    """Finding about the settings of a firmware: others are better, or hardly so."""
     settings = calibration.session.firmware
     if settings is None:
         return []
@@ -324,12 +324,11 @@ def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -
         fit = fit_firmware(calibration, settings.firmware, tool=tool)
     except ExportError:  # no bed, or no workspace; the export names it
         return []
-    if fit.worth_entering:
-        return []
     return [
-        words.settings_kept(
+        words.settings_change(
             tool=tuple(fit.expect_tool(e) for e in (fit.now, fit.new)),
             layer=tuple(fit.expect_layer(e) for e in (fit.now, fit.new)),
+            keep=not fit.worth_entering,
         )
     ]
 

@@ -236,7 +236,8 @@ def validate_calibration(
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
-    entries, notes = _choose_entries(calibration, joint, all_sessions, mistake)
+    unchanged = all(one.firmware == calibration.session.firmware for one in new)
+    entries, notes = _choose_entries(calibration, joint, all_sessions, mistake, unchanged=unchanged)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, judgement, stated=stated)
@@ -490,6 +491,8 @@ def _choose_entries(
     joint: Calibration | None,
     all_sessions: Session,
     mistake: Anomaly | None,
+    *,
+    unchanged: bool,
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
     """Values to enter after the new readings, and findings about them.
 
@@ -500,22 +503,29 @@ def _choose_entries(
         joint: Joint calibration; None if the calibration is not confirmed.
         all_sessions: All sessions.
         mistake: Change between the sessions; None without any.
+        unchanged: Whether the new sessions state the settings of the calibration's firmware.
     """
     if joint is None:
         wrongly = _is_wrongly_entered(all_sessions, mistake)
         return (find_entries(calibration) if wrongly else ()), []
-    assessment, findings = assessment_of(joint), _find_further_change(joint)
+    assessment, findings = assessment_of(joint), _find_further_change(joint, unchanged=unchanged)
     entries = assessment.entries if findings else find_entries(calibration)
     return entries, [*findings, *assessment.of_kind(*ENTRY_KINDS)]
 
 
-def _find_further_change(joint: Calibration) -> list[Finding]:
-    """Finding about offsets that the joint calibration changes; empty if there is none."""
+def _find_further_change(joint: Calibration, *, unchanged: bool) -> list[Finding]:
+    """Finding about offsets or settings that the joint calibration changes; empty without any.
+
+    Args:
+        joint: Joint calibration.
+        unchanged: Whether the new sessions state the settings of the calibration's firmware.
+    """
     assessment = assessment_of(joint)
     if assessment.keeps_offsets:
         return []
     if joint.session.firmware is not None:
-        return [words.further_settings()]
+        change = next(iter(assessment.of_kind("settings improve")), None)
+        return [words.further_settings(change, unchanged=unchanged)]
     return [words.further_change([e for e in assessment.entries if is_significant(joint, e)])]
 
 

@@ -78,6 +78,7 @@ FindingKind = Literal[
     # values to enter
     "no offset",
     "no change needed",
+    "settings improve",
     "must change",
     "not significant",
     "controller not stated",

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 import orthocal
-from orthocal.arrays import Array
 from orthocal.cli.options import state_tolerances
 from orthocal.errors import SessionError
 from orthocal.text import spans
+
+if TYPE_CHECKING:
+    from orthocal.arrays import Array
 
 ROUNDING = 1e-9
 """Rounding error of readings, and of travels that follow from other settings, [m]."""
@@ -122,6 +123,8 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
     Raises:
         SessionError: If it is a copy; names both sessions and the lines that differ.
     """
+    import numpy as np
+
     values = {r.key: _measured(other, r) for r in other.readings if r.is_read}
     common = [r for r in session.readings if r.is_read and r.key in values]
     equal = [r for r in common if np.allclose(_measured(session, r), values[r.key], 0.0, ROUNDING)]
@@ -143,6 +146,8 @@ def _measured(session: orthocal.Session, reading: orthocal.Reading) -> Array:
 
     Those are the travels of the carriages below their endstops, which no setting changes.
     """
+    import numpy as np
+
     if session.firmware is None:
         return np.array([reading.value])
     postures = [p for p in (reading.posture, reading.minus) if p is not None]

@@ -16,6 +16,13 @@ from orthocal.text import printable, shorten
 from orthocal.units import MM
 
 
+OF_TABLES = (
+    *("--sheet", "--decimal", "--separator", "--unit"),
+    *("--encoding", "--column", "--fill", "--replace"),
+)
+"""Options that apply to tables only."""
+
+
 @command(name="import")
 def import_(
     table: Path,
@@ -63,16 +70,7 @@ def import_(
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
     if format or settings or radius_mm is not None or _is_printer_log(table):
-        _refuse_options(
-            sheet=sheet,
-            decimal=decimal,
-            separator=separator,
-            unit=unit,
-            encoding=encoding,
-            column=column,
-            fill=fill,
-            replace=replace,
-        )
+        _refuse_options(sheet, decimal, separator, unit, encoding, column, fill, replace)
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
     _require_session(table, session)
@@ -109,16 +107,15 @@ def _show(result: orthocal.TableImport, *, dry_run: bool, json: bool) -> None:
         put_note("Nothing written: the session already has all readings")
 
 
-def _refuse_options(**values: object) -> None:
-    """Refuse options of tables for the log of a printer.
+def _refuse_options(*values: object) -> None:
+    """Refuse options of tables, in the order of `OF_TABLES`, for the log of a printer.
 
     Raises:
         SessionError: If one has a value; names it.
     """
-    for name, value in values.items():
+    for name, value in zip(OF_TABLES, values, strict=True):
         if value:
-            problem = "is for tables; found the log of a printer"
-            raise SessionError(problem, where=f"--{name}")
+            raise SessionError("is for tables; found the log of a printer", where=name)
 
 
 def _is_printer_log(table: Path) -> bool:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orthocal.assessment.printer_settings import FirmwareFit, fit_firmware
+from orthocal.assessment.wording import tool_mm
 from orthocal.calibration.calibration import Calibration
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.printers.settings import FirmwareName
-from orthocal.units import MM
 
 
 def export_printer(calibration: Calibration, firmware: FirmwareName) -> dict[str, str]:
@@ -134,30 +134,22 @@ def _expectations(title: str, fit: FirmwareFit) -> list[str]:
     """Table of the expected errors, and their limits."""
 
     def row(words: str, *values: float) -> str:
-        return f"| {words} | {' | '.join(f'{v / MM:.3f}' for v in values)} |"
+        return f"| {words} | {' | '.join(tool_mm(v).removesuffix(' mm') for v in values)} |"
 
-    tool, layer = fit.expect_tool(fit.new), fit.expect_layer(fit.new)
+    tool, layer = ((e(fit.now), e(fit.new)) for e in (fit.expect_tool, fit.expect_layer))
+    new = fit.new
     return [
-        "| mm | now | new | largest, new |",
-        "|---|---|---|---|",
-        row(
-            "tool error of the settings, RMS over the workspace",
-            fit.now.tool_rms,
-            fit.new.tool_rms,
-            fit.new.tool_largest,
-        ),
-        row(
-            "height error of the first layer, RMS",
-            fit.now.layer_rms,
-            fit.new.layer_rms,
-            fit.new.layer_largest,
-        ),
+        "| expected error, RMS in mm | now | new |",
+        "|---|---|---|",
+        row("tool, over the workspace", *tool),
+        row("height of the first layer", *layer),
         "",
-        f"{title} has no other settings for the geometry. The calibration identified errors that "
-        "they cannot express, such as towers that lean.",
+        f"{title} has no other settings for the geometry. Errors that they cannot express, such as "
+        f"towers that lean, leave {tool_mm(new.tool_rms)} at the tool (largest "
+        f"{tool_mm(new.tool_largest)}) and {tool_mm(new.layer_rms)} in the height of the first "
+        f"layer (largest {tool_mm(new.layer_largest)}). The rest is the uncertainty of the "
+        "calibration.",
         "",
-        f"With the uncertainty of the calibration, expect a tool error of {tool / MM:.2g} mm RMS, "
-        f"and a height error of the first layer of {layer / MM:.2g} mm RMS. A probed bed hardly "
-        "determines the size of a print: longer rods with a larger radius print equally flat. "
-        "Measure a large print, or the rods.",
+        "A probed bed hardly determines the size of a print: longer rods with a larger radius print"
+        " equally flat. Measure a large print, or the rods.",
     ]

@@ -28,7 +28,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
-from orthocal.assessment import assess, comparison
+from orthocal.assessment import judgement as judgement_module
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.wording import describe_actions
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
@@ -283,9 +283,8 @@ def judged(monkeypatch):
         sessions.append(session)
         return judge_session(session)
 
-    monkeypatch.setattr(orthocal, "judge_session", count, raising=False)
-    for module in (assess, comparison):
-        monkeypatch.setattr(module, "judge_session", count)
+    for module in (orthocal, judgement_module):
+        monkeypatch.setattr(module, "judge_session", count, raising=False)
     return sessions
 
 

@@ -75,7 +75,7 @@ def probe_log(firmware, printer, settings, rng):
 
 def promised(page):
     """RMS height of the first layer that the README expects, [mm]."""
-    return float(re.search(r"first layer of ([\d.e-]+) mm", page)[1])
+    return float(re.search(r"height of the first layer \| [\d.]+ \| ([\d.]+) \|", page)[1])
 
 
 @pytest.mark.usefixtures("short_reports")
@@ -211,6 +211,25 @@ def test_settings_keep_stated_tolerances_and_effects(calibrated, probed_again):
         assert moved.effect_names == ("drift",)
         assert moved.parameters.stated == {glob: 7.0}
         assert not probed_again.on_printer(other, homed).robot.parameters.stated
+
+
+def test_settings_that_were_not_entered_are_named(calibrated, tmp_path):
+    """The bed is probed again with the settings of the first log."""
+    printer, calibration = calibrated
+    text = probe_log("klipper", printer, nominal(), np.random.default_rng(4))
+    (tmp_path / "log.txt").write_text(text)
+    validation = validate_calibration(calibration, import_printer_log(tmp_path / "log.txt").session)
+    assert validation.confirmed
+    assert not validation.nothing_to_change
+    (change,) = validation.assessment.of_kind("further change")
+    assert "new ones are not active" in change.text
+    (stated,) = validation.joint.assessment.of_kind("settings improve")
+    assert stated.text in change.text
+    fit = fit_firmware(validation.joint, "klipper")
+    errors = [fit.expect_layer(fit.now), fit.expect_layer(fit.new)]
+    numbers = [stated.numbers[f"layer_{name}_um"] for name in ("now", "best")]
+    assert numbers == pytest.approx(np.array(errors) / UM, rel=1e-6)
+    assert numbers[0] > 5.0 * numbers[1]
 
 
 def test_the_second_probing_ends_the_walk(calibrated, probed_again):

@@ -117,18 +117,24 @@ def no_change_needed(
     return note("no change needed", text, "", parameter_places(*drives), **numbers)
 
 
-def settings_kept(*, tool: tuple[float, ...], layer: tuple[float, ...]) -> Finding:
-    """Finding that the settings of a printer's firmware are kept.
+def settings_change(*, tool: tuple[float, ...], layer: tuple[float, ...], keep: bool) -> Finding:
+    """Finding about the errors with the present and with the best settings of a firmware.
 
     Args:
         tool: Expected tool error with the present and with the best settings, [m].
         layer: Expected height error of the first layer with them, [m].
+        keep: Whether the present settings are kept.
     """
     texts = [f"from {tool_mm(now)} to {tool_mm(new)}" for now, new in (layer, tool)]
+    head = (
+        "Nothing more has to be entered: the best settings would change"
+        if keep
+        else "New settings change"
+    )
     return note(
-        "no change needed",
-        "Nothing more has to be entered: the best settings would change the expected height error "
-        f"of the first layer {texts[0]}, and the tool error {texts[1]}.",
+        "no change needed" if keep else "settings improve",
+        f"{head} the expected height error of the first layer {texts[0]}, and the tool error "
+        f"{texts[1]}.",
         now_um=tool[0] / UM,
         best_um=tool[1] / UM,
         layer_now_um=layer[0] / UM,

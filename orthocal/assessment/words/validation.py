@@ -113,12 +113,23 @@ def further_change(entries: Sequence[ControllerEntry]) -> Finding:
     )
 
 
-def further_settings() -> Finding:
-    """Finding that the joint calibration improves the settings of a printer's firmware."""
+def further_settings(change: Finding | None, *, unchanged: bool) -> Finding:
+    """Finding that the joint calibration improves the settings of a printer's firmware.
+
+    Args:
+        change: Finding about the errors with new settings; None if they are unknown.
+        unchanged: Whether the new log states the settings of the calibration.
+    """
+    texts = ["Settings from both probings are still better."]
+    if change is not None:
+        texts.append(change.text)
+    if unchanged:
+        texts.append("The new log states the settings of the earlier one: new ones are not active.")
     return note(
         "further change",
-        "Settings from both probings are still better.",
+        " ".join(texts),
         "Calibrate the sessions together and export again.",
+        **({} if change is None else change.numbers),
     )
 
 

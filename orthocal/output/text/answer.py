@@ -67,6 +67,7 @@ LISTED: tuple[FindingKind, ...] = (
     "periodic errors",
     "held by a bound",
     "not significant",
+    "settings improve",
     "line assumed",
     "effect not shown",
     "effects inseparable",
