@@ -91,6 +91,7 @@ def calibrate(
         profile: Names or globs of free parameters whose profile-likelihood intervals are computed.
         start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; nuisance
             parameters then start at 0. By default all parameters start at the linearised solution.
+            Not used by the solver `linearised`, which needs none.
         judgement: Judgement of these sessions with these effects and tolerances, if it was computed
             already.
 

@@ -15,7 +15,6 @@ from orthocal.io.files import exists
 from orthocal.text import printable, shorten
 from orthocal.units import MM
 
-
 OF_TABLES = (
     *("--sheet", "--decimal", "--separator", "--unit"),
     *("--encoding", "--column", "--fill", "--replace"),
@@ -43,8 +42,8 @@ def import_(
 ) -> None:
     """Import readings from a spreadsheet, or the log of a printer.
 
-    Encoding, separator, decimal sign and units are detected. An ambiguous table is refused with
-    the option that decides. Rows match those of the session by setup, posture, minus and cycle.
+    Encoding, separator, decimal sign and units are detected. An ambiguous table is refused with the
+    option that decides. Rows match those of the session by setup, posture, minus and cycle.
 
     The log of a delta printer becomes a new session with its robot: heights of the bed that
     Klipper, Marlin or RepRapFirmware probed. It contains the settings of the firmware, or
@@ -52,8 +51,7 @@ def import_(
 
     Args:
         table (TABLE): CSV file of any spreadsheet program, or .xlsx workbook; or a printer's log.
-        session (SESSION): session.yaml, or the directory that contains it; a new directory for a
-            printer's log.
+        session (SESSION): session.yaml, or its directory; a new directory for a printer's log.
         sheet: Worksheet of a workbook.
         decimal (comma|point): Decimal sign of the readings.
         separator (semicolon|tab|comma|pipe): Separator of the cells.

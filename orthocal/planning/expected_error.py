@@ -88,7 +88,7 @@ class Expected:
         return self.tool.sizes.reported
 
     def rms_by(self, criterion: Criterion) -> float:
-        """RMS tool error that a criterion minimises, [m]; NaN if it minimises no RMS tool error."""
+        """RMS tool error of a criterion, [m]; NaN if it minimises no RMS tool error."""
         sizes = self.sizes
         forms = {"aligned": sizes.reported, "relative": sizes.relative, "absolute": sizes.absolute}
         return forms[criterion].rms if criterion in forms else math.nan

@@ -93,6 +93,7 @@ def _read_heights(source: LogText) -> PrinterLog:
         SessionError: If a line of the probe is damaged, or there are too few points.
     """
     text, where = source.text, source.name
+    files = " and ".join(name for name, _ in source.files)
     sections = _sections(text)
     probe = _probe_offset(sections, where)
     if runs := list(_RUN.finditer(text)):
@@ -111,9 +112,9 @@ def _read_heights(source: LogText) -> PrinterLog:
         else []
     )
     if steps is not None and not is_newer:
-        settings = _settings(sections, probe, where)
+        settings = _settings(sections, probe, files)
         return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
-    settings = _settings(sections, probe, where)
+    settings = _settings(sections, probe, files)
     points = np.array([_probed(m, source) for m in matches]).reshape(-1, 3) * MM
     contacts = [m.re is _NEW_PROBE for m in matches]  # newer versions print the point of contact
     points -= np.outer(contacts, settings.probe)

@@ -37,6 +37,9 @@ SMALL_REACH = 1.0 / 3.0
 """Distance of the outermost point from the middle, relative to the radius of the printer, below
 which points hardly determine radius, rods and towers."""
 
+LARGE_HEIGHT = 5.0 * MM
+"""Median height of the bed that is more likely a wrong offset of the probe, [m]."""
+
 LARGE_TOWER_ANGLE = 2.0 * DEG
 """Angular error of a tower that more likely absorbs another error, [rad]."""
 
@@ -260,6 +263,13 @@ def unusual_content(settings: DeltaSettings, carriages: Array) -> Iterator[str]:
     """
     with np.errstate(invalid="ignore"):  # of damaged steps; the calibration refuses them
         reach = float(np.hypot(*settings.forward(carriages)[:, :2].T).max())
+        height = float(np.median(settings.touched(carriages)[:, 2]))
+    if abs(height) > LARGE_HEIGHT:
+        yield (
+            f"The firmware sees the bed at a height of {height / MM:.3f} mm. If the printer prints "
+            "on the bed, the offset of the probe is wrong, or the settings are not those of the "
+            "probing. The new endstops would be wrong by this height."
+        )
     if reach < SMALL_REACH * settings.radius:
         yield (
             f"All points are within {reach / MM:.0f} mm of the middle. They hardly determine "

@@ -359,6 +359,16 @@ def test_options_of_tables_are_refused_for_a_log(tmp_path):
     assert "exists already; choose another directory" in done.stderr
 
 
+@pytest.mark.parametrize("height", [-17.2, 0.0, 4.0])
+def test_a_bed_far_from_its_height_is_named(probed, height):
+    """A console without the offset of the probe, which the settings state."""
+    text = write_settings("klipper", odd()) + "[probe]\nz_offset: 17.2\n"
+    text += "".join(f"probe at {x:.3f},{y:.3f} is z={17.2 + height:.3f}\n" for x, y in rings())
+    notes = [note for note in probed(text).notes if "the offset of the probe is wrong" in note]
+    assert len(notes) == (abs(height) > 5.0)
+    assert all(f"{height:.3f} mm" in note for note in notes)
+
+
 def test_what_two_readers_of_a_setting_disagree_about_is_refused(probed):
     """A colon in M666 beside what G33 printed, as a damaged line has it."""
     text = (

@@ -36,7 +36,7 @@ MORE = "--details prints scores, estimates and residuals of each model."
 
 RESEARCH: tuple[FindingKind, ...] = (
     *("recommended", "not recommended", "tool error", "linearisation cost"),
-    *("noise as stated", "noise from cycles"),
+    *("noise as stated", "noise from cycles", "common approach"),
 )
 """Kinds of findings that the short answer replaces, or that only the details list."""
 

@@ -35,6 +35,7 @@ from orthocal.output.text.layout import (
 from orthocal.units import MM
 
 DETAILS: tuple[FindingKind, ...] = (
+    "common approach",
     "as predicted",
     "larger than predicted",
     "must change",
