@@ -353,7 +353,10 @@ def _entry_findings(
     if not entries:
         return [words.no_offset(), *findings]
     if entries[0].active is None:
-        findings.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
+        name, joined = calibration.setups[-1].name, bool(calibration.session.parts)
+        last = split_label(name, joined=joined)[0]
+        drives = [e.drive for e in entries]
+        findings.append(words.controller_not_stated(drives, keep=keep, last=last))
     elif not calibration.session.parts and any(e.active for e in entries):
         findings.append(words.earlier_readings())
     determined = _determined_by_readings(entries)

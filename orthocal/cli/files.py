@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import orthocal
 from orthocal.cli.options import state_tolerances
 from orthocal.errors import SessionError
 from orthocal.text import spans
-
-if TYPE_CHECKING:
-    from orthocal.arrays import Array
 
 ROUNDING = 1e-9
 """Rounding error of readings, and of travels that follow from other settings, [m]."""
@@ -123,13 +119,11 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
     Raises:
         SessionError: If it is a copy; names both sessions and the lines that differ.
     """
-    import numpy as np
-
     values = {r.key: _measured(other, r) for r in other.readings if r.is_read}
     common = [r for r in session.readings if r.is_read and r.key in values]
-    equal = [r for r in common if np.allclose(_measured(session, r), values[r.key], 0.0, ROUNDING)]
+    equal = [r for r in common if _are_equal(_measured(session, r), values[r.key])]
     complete = len(equal) == len(session.readings) == len(other.readings)
-    if len({tuple(values[r.key].tolist()) for r in equal}) < FEWEST_DIFFERENT or not (
+    if len({values[r.key] for r in equal}) < FEWEST_DIFFERENT or not (
         complete or _are_copied(session, common, equal)
     ):
         return
@@ -141,18 +135,21 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
     )
 
 
-def _measured(session: orthocal.Session, reading: orthocal.Reading) -> Array:
+def _measured(session: orthocal.Session, reading: orthocal.Reading) -> tuple[float, ...]:
     """Numbers that a measurement determines: the reading, and the postures of a printer's log.
 
     Those are the travels of the carriages below their endstops, which no setting changes.
     """
-    import numpy as np
-
     if session.firmware is None:
-        return np.array([reading.value])
+        return (reading.value,)
     postures = [p for p in (reading.posture, reading.minus) if p is not None]
     travels = [session.firmware.homed - session.postures[p].drives for p in postures]
-    return np.concatenate([[reading.value], *travels])
+    return reading.value, *(v for travel in travels for v in travel.tolist())
+
+
+def _are_equal(one: Sequence[float], other: Sequence[float]) -> bool:
+    """True if numbers are equal except for rounding errors."""
+    return all(abs(a - b) <= ROUNDING for a, b in zip(one, other, strict=True))
 
 
 def _are_copied(

@@ -105,13 +105,10 @@ def _read_heights(source: LogText) -> PrinterLog:
     begin = 0 if has_analysis(source) and not matches else source.begin
     saved = _sections(text[begin:]).get("delta_calibrate", {})
     steps = _saved_heights(saved, where)
-    is_newer = bool(matches) and text.rfind("height0_pos") < matches[-1].start()
-    notes = (
-        [f"{len(steps[0])} saved heights are not used: they are older."]
-        if (steps is not None and is_newer)
-        else []
-    )
-    if steps is not None and not is_newer:
+    notes = []
+    if steps is not None and matches and _first_saved(text) < matches[-1].start():
+        notes.append(f"{len(steps[0])} saved heights are not used: they are older.")
+    elif steps is not None:
         settings = _settings(sections, probe, files)
         return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
     settings = _settings(sections, probe, files)
@@ -124,6 +121,12 @@ def _read_heights(source: LogText) -> PrinterLog:
     if "z_offset" not in keys:
         notes.append(unstated_trigger(f"z_offset in [{name}]"))
     return probed_log(settings, points[used], where=where, expected=EXPECTED, notes=notes)
+
+
+def _first_saved(text: str) -> int:
+    """Position at which the last saved heights are for the first time: each start prints them."""
+    last = text[text.rfind("height0_pos") :]
+    return text.find(last.partition("\n")[0])
 
 
 def _require_points(source: LogText) -> None:

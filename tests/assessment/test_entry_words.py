@@ -34,3 +34,4 @@ def test_drives_and_verbs_have_one_number():
 def test_changes_are_added_unless_the_offsets_stay(drives):
     assert words.controller_not_stated(drives, keep=False).action
     assert not words.controller_not_stated(drives, keep=True).action
+    assert "last session, bar," in words.controller_not_stated(drives, keep=True, last="bar").text

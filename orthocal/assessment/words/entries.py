@@ -162,13 +162,15 @@ def _describe_change(drives: Sequence[str], compared: str) -> str:
     return f"{joined(drives)} {change} by {compared} than {their} uncertainty."
 
 
-def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
+def controller_not_stated(drives: Sequence[str], *, keep: bool, last: str = "") -> Finding:
     """Finding that the values to enter are changes, as the active offsets are not stated.
 
     Args:
         drives: Drives with a value to enter.
         keep: Whether the active offsets are kept.
+        last: Label of the last of several sessions; "" for one session.
     """
+    which = f"The last session, {last}," if last else "The session"
     if len(drives) == 1:
         meaning = "The value is a change, not a complete offset"
         action = f"Add it to the active offset of {drives[0]}."
@@ -177,7 +179,7 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
         action = "Add each to the active offset of its drive."
     return note(
         "controller not stated",
-        f"The session does not state the active offsets (`controller`). {meaning}.",
+        f"{which} does not state the active offsets (`controller`). {meaning}.",
         "" if keep else action,
     )
 
