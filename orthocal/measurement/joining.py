@@ -33,14 +33,17 @@ def gather_sessions(sources: Given | Sequence[Given]) -> list[Session]:
     """List of one or several sessions; paths are loaded.
 
     Raises:
-        SessionError: If a path does not lead to a valid session.
+        SessionError: If a path does not lead to a valid session, or two sessions are the same.
         TypeError: If an argument has another type.
     """
     listed = [sources] if isinstance(sources, Session | str | Path) else sources
     require_kind(listed, (list, tuple), expected="a Session, the path to one, or a list of them")
     for source in listed:
         require_kind(source, (Session, str, Path), expected="a Session, or the path to one")
-    return [source if isinstance(source, Session) else load_session(source) for source in listed]
+    sessions = [s if isinstance(s, Session) else load_session(s) for s in listed]
+    for i, session in enumerate(sessions):
+        require_another(session, sessions[:i])
+    return sessions
 
 
 def join_sessions(sessions: Sequence[Session]) -> Session:
@@ -55,8 +58,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             returned unchanged.
 
     Raises:
-        SessionError: If there is no session, if two are the same, or if robots, effects, firmware
-            or tolerances differ.
+        SessionError: If there is no session, or if robots, effects, firmware or tolerances differ.
         TypeError: If an argument has another type.
     """
     require_kind(sessions, (list, tuple), expected="a list of Sessions, as load_session returns")
@@ -64,8 +66,6 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         require_kind(session, Session, expected="a Session, as load_session returns")
     if not sessions:
         raise SessionError("there is no session to join")
-    for i, session in enumerate(sessions):
-        require_another(session, sessions[:i])
     if len(sessions) == 1:
         return sessions[0]
     if settings := sessions[0].firmware:

@@ -186,9 +186,8 @@ def plan_readings(
         equipment: Available gauge, tip and region.
         measured: Existing readings, which the plan complements.
         workspace: Region over which the tool error is computed; by default the robot's.
-        criterion: Figure to minimise; see `planning.expected_error.Criterion`. It is minimised
-            about the nominal machine. The errors that the plan states are means over machines
-            within their tolerances, for which another plan may be slightly better.
+        criterion: Figure to minimise about the nominal machine; see `expected_error.Criterion`.
+            The errors that the plan states are means over machines within their tolerances.
         seed: Seed of the random starts of the search.
         starts: Number of starts of the search; by default 3, or more for few candidates.
         reference: Name of the robot in the session; by default that of the model.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from datetime import timedelta
 
@@ -26,9 +27,11 @@ def plan():
 
 def under(session, change):
     """Session with other conditions, by a function of the row and its present ones."""
-    readings = [
-        replace(r, conditions=change(i, r.conditions)) for i, r in enumerate(session.readings)
-    ]
+    readings, counts = [], Counter()
+    for i, r in enumerate(session.readings):
+        changed = replace(r, conditions=change(i, r.conditions))
+        counts[changed.place] += 1
+        readings.append(replace(changed, cycle=counts[changed.place]))
     return replace(session, readings=tuple(readings))
 
 

@@ -193,7 +193,7 @@ def test_files_state_the_posture(workshop, calibration, tmp_path):
 
 def test_joined_sessions_keep_their_postures(workshop):
     setups = {n: replace(s, aligned_at=f"{s.sensor.leg}_max") for n, s in workshop.setups.items()}
-    joined = join_sessions([workshop, replace(workshop, setups=setups, sha256="")])
+    joined = join_sessions([workshop, replace(workshop, setups=setups)])
     own = [name.partition("/")[2] for name in joined.alignment_postures.values()]
     assert own == ["zero"] * len(setups) + [s.aligned_at for s in setups.values()]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibrated import session_of
 
-from orthocal import Conditions, Mounting, Tip, calibrate, join_sessions, judge_session
+from orthocal import Conditions, Mounting, Tip, calibrate, judge_session
 from orthocal.errors import SessionError
 from orthocal.session.completeness import require_complete
 
@@ -83,7 +83,7 @@ def test_sizes_of_tips_and_mountings_are_not_negative():
 def test_readings_do_not_count_twice(session):
     for both in ([session, session], [session, replace(session, title="copy")]):
         with pytest.raises(SessionError, match="is the same session as one before it"):
-            join_sessions(both)
+            calibrate(both)
 
 
 def test_a_judgement_is_used_for_its_readings_only(session):
