@@ -12,9 +12,13 @@ from orthocal import (
     CalibrationProblem,
     Choice,
     LiveScene,
+    Machine,
+    NonlinearProgram,
     SolverOptions,
     assess,
     assess_tool,
+    build_accuracy_study,
+    build_linearisation_study,
     calibrate,
     compare_models,
     draw_scene,
@@ -23,7 +27,9 @@ from orthocal import (
     load_robot,
     load_session,
     parameter_table,
+    plan_readings,
     reading_table,
+    recommend_model,
     simulate_session,
     summarize,
     validate_calibration,
@@ -222,6 +228,29 @@ def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
         LoopClosure(5)
 
 
+@pytest.mark.parametrize(
+    ("build", "arguments"),
+    [
+        (build_accuracy_study, {"machines": -1}),
+        (build_linearisation_study, {"count": 0}),
+        (build_linearisation_study, {"directions": 1.5}),
+        (build_linearisation_study, {"sizes": [np.nan]}),
+        (build_linearisation_study, {"largest": 0.0}),
+    ],
+)
+def test_numbers_of_studies(build, arguments, experiment_2):
+    with pytest.raises(ParameterError, match=r"expected a (whole number of at least 1|positive)"):
+        build(experiment_2, **arguments)
+
+
+def test_a_machine_keeps_its_errors(orthoglide):
+    errors = {"x_slide.offset": 1e-3}
+    machine = Machine(orthoglide, errors)
+    before = machine.forward(orthoglide.drive_zero)
+    errors["x_slide.offset"] = 2e-3
+    assert np.array_equal(machine.forward(orthoglide.drive_zero), before)
+
+
 def test_points_far_beyond_all_numbers(calibration):
     with pytest.raises(OrthocalError, match="cannot be reached"):
         calibration.machine.inverse([1e308, 0.0, 0.0])
@@ -247,6 +276,17 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
         (lambda: reading_table(experiment_2), "expected a Calibration"),
         (lambda: CalibrationProblem(experiment_2, "full"), "expected a Selection"),
         (lambda: simulate_session(5, {}), "expected a Session"),
+        (lambda: recommend_model("raw-cycles"), "expected a Session"),
+        (lambda: assess_tool(calibration, np.zeros((5, 3))), "expected a Workspace"),
+        (lambda: assess_tool(calibration, conditions="ppp"), "expected UseConditions"),
+        (lambda: NonlinearProgram(experiment_2), "expected a CalibrationProblem"),
+        (lambda: plan_readings("orthoglide"), "expected a Robot"),
+        (lambda: plan_readings(experiment_2.robot, measured="x"), "expected a Session"),
+        (lambda: plan_readings(experiment_2.robot, equipment="x"), "expected Equipment"),
+        (lambda: Machine("orthoglide", {}), "expected a Robot"),
+        (lambda: Machine(experiment_2.robot, [1]), "errors: found a list"),
+        (lambda: build_linearisation_study("x"), "expected a Robot or a Session"),
+        (lambda: build_linearisation_study(experiment_2, free="*.offset"), "expected a list"),
         (lambda: simulate_session(experiment_2, 5), "errors: found a int; expected a mapping"),
         (lambda: simulate_session(experiment_2, {"x_slide.offset": "a"}), "expected a name and"),
         (lambda: draw_scene("nonsense"), "expected a Calibration, a Session or a Robot"),

@@ -20,6 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.errors import OrthocalError
 from orthocal.estimation.selection import complete_model
@@ -81,7 +82,11 @@ def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendat
     Args:
         session: The session, or several that were joined: their log evidence is added.
         models: Models of the robot to compare with the complete model; by default all.
+
+    Raises:
+        TypeError: If an argument is of another kind.
     """
+    require_kind(session, Session, expected="a Session, as load_session returns")
     return _recommend(session, tuple(models))
 
 

@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import (
     CalibratedTool,
@@ -251,10 +252,14 @@ def assess_tool(
         RobotError: If the robot has no tool centre point, or its drives do not command it.
         ClosureError: If the machine cannot reach a point, or no box of ±1 mm.
         ParameterError: If a condition is out of range, or nothing depends on it.
+        TypeError: If an argument is of another kind.
     """
     require_calibration(calibration)
+    if workspace is not None:
+        require_kind(workspace, Workspace, expected="a Workspace, such as Workspace.even(points)")
     use = None
     if conditions is not None:
+        require_kind(conditions, UseConditions, expected="UseConditions(...)")
         conditions.require_valid(calibration.robot)
         use = sample_use(calibration.robot, conditions)
         if not use.varying:  # one sample: the stated conditions, also those that no effect needs

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
+from orthocal.arguments import require_kind, require_numbers
 from orthocal.arrays import Array
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure, as_rows, find_beyond_travel
@@ -20,6 +21,11 @@ class Machine:
     robot: Robot
     errors: Mapping[str, float]
     """Parameter to value, such as {"x_slide.offset": 1e-3}, [SI]; absent ones are 0."""
+
+    def __post_init__(self) -> None:
+        require_kind(self.robot, Robot, expected="a Robot, such as load_robot(...)")
+        require_numbers(self.errors, argument="errors")
+        object.__setattr__(self, "errors", dict(self.errors))
 
     def forward(
         self,

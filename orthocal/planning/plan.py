@@ -7,9 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import NoneType
 
 import numpy as np
 
+from orthocal.arguments import require_kind, require_seed
 from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
@@ -199,11 +201,9 @@ def plan_readings(
             candidate readings.
         RobotError: If the drives do not command the tool.
         SessionError: If the repeatability of the existing readings is unknown.
+        TypeError: If an argument is of another kind.
     """
-    if criterion not in CRITERIA:
-        raise ParameterError(
-            f"found '{criterion}'; expected one of {', '.join(CRITERIA)}", where="criterion"
-        )
+    _require_arguments(robot, measured, equipment, criterion, seed)
     work = _SearchOptions(criterion, seed, starts, workers, report or (lambda text: None))
     measured = None if measured is None else state_noise(measured)
     chosen = resolve_choice(choice, measured, default_model=MODEL)
@@ -217,6 +217,20 @@ def plan_readings(
     session = list_candidates(robot, equipment, reference=reference)
     session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
     return _plan(session, options, forecast, equipment, measured, work)
+
+
+def _require_arguments(
+    robot: object, measured: object, equipment: object, criterion: str, seed: int
+) -> None:
+    """Refuse arguments of `plan_readings` of another kind, and an unknown criterion."""
+    require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
+    require_kind(measured, (Session, NoneType), expected="a Session, as load_session returns")
+    require_kind(equipment, (Equipment, NoneType), expected="Equipment(...)")
+    require_seed(seed)
+    if criterion not in CRITERIA:
+        raise ParameterError(
+            f"found '{criterion}'; expected one of {', '.join(CRITERIA)}", where="criterion"
+        )
 
 
 def _totals(counts: Sequence[int]) -> tuple[int, int]:

@@ -30,7 +30,7 @@ from orthocal.robot.parameters import Parameter, ParameterSet
 from orthocal.session.session import Session
 from orthocal.study.random_machines import CALIBRATED, RandomMachines
 from orthocal.study.runner import StudyTable
-from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
+from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once, require_counts
 from orthocal.units import UM
 
 PREDICTED_MACHINES = 60
@@ -186,6 +186,7 @@ def build_accuracy_study(
         SessionError: If the noise of a gauge is missing, or a condition that an effect needs.
         RobotError: If the drives do not command the tool.
     """
+    require_counts(machines=machines)
     chosen = resolve_choice(choice, session, default_model="full")
     if chosen.effects is not None:
         session = session.with_effects(chosen.effects)

@@ -25,7 +25,7 @@ from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
 from orthocal.study.runner import StudyTable
-from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
+from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once, require_counts
 
 Resampled = Literal["residuals", "cycles"]
 
@@ -129,8 +129,7 @@ def build_bootstrap_study(
     if by not in get_args(Resampled):
         expected = " or ".join(get_args(Resampled))
         raise ParameterError(f"found {by!r}; expected {expected}", where="by")
-    if draws < 1:
-        raise ParameterError(f"found {draws}; expected at least 1", where="draws")
+    require_counts(draws=draws)
     study = BootstrapStudy(session, resolve_choice(choice, session), by, draws, seed)
     prepare_once(study)  # refuses a session that cannot be resampled
     return study

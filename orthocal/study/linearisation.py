@@ -6,6 +6,7 @@ equations alone. Noise and resolution serve as a comparison.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arguments import require_kind, require_names
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError, ParameterError, SolverError
 from orthocal.estimation.fit import require_determined
@@ -35,7 +37,7 @@ from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.study.runner import StudyTable
-from orthocal.study.study import Columns, Study, prepare_once
+from orthocal.study.study import Columns, Study, prepare_once, require_counts
 from orthocal.units import MM
 
 Flags = NDArray[np.bool_]
@@ -267,6 +269,17 @@ class _Prepared:
         return {**errors, **dict.fromkeys(METHODS[3:], general)}
 
 
+def _require_sizes(sizes: Sequence[float]) -> None:
+    """Refuse sizes that are not positive.
+
+    Raises:
+        ParameterError: If there is one.
+    """
+    for size in sizes:
+        if not 0.0 < size < math.inf:
+            raise ParameterError(f"found {size}; expected a positive size", where="sizes")
+
+
 def build_linearisation_study(
     source: Robot | Session,
     *,
@@ -283,8 +296,7 @@ def build_linearisation_study(
     """Build a study of the errors of linearised identification.
 
     Args:
-        source: A robot of Orthoglide type, measured by the paper's plan; or a session of any robot,
-            without the paper's equations.
+        source: A robot of Orthoglide type, measured as in the paper; or a session of any robot.
         free: Names or globs of the errors that increase and are identified.
         largest: Largest size of a machine, [mm or mrad]: its largest error component.
         count: Number of sizes, a geometric sequence from 0.1 mm; the largest alone with 1.
@@ -292,13 +304,17 @@ def build_linearisation_study(
         along: One direction in place of random ones: a number for each error.
         sizes: Sizes in place of `largest` and `count`, [mm or mrad].
         displacements: Displacements of the paper's postures.
-        gauge: Gauge of the comparison; default: that of the session, or the paper's.
+        gauge: Gauge of the comparison; default: that of the session or of the paper.
         seed: Seed of the directions.
 
     Raises:
         ParameterError: If nothing can be identified, or a number is invalid.
         RobotError: If the robot cannot be measured by the paper's plan.
     """
+    require_kind(source, (Robot, Session), expected="a Robot or a Session")
+    require_names(free, argument="free")
+    require_counts(count=count, directions=directions)
+    _require_sizes([largest, *(sizes or ())])
     robot = source if isinstance(source, Robot) else source.robot
     names = robot.parameters.select(free)
     if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:

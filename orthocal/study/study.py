@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from numbers import Integral
 from operator import attrgetter
 from typing import Any, ClassVar, cast
 
@@ -18,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
 from orthocal.effects.loading import load_robot_content, with_adjustments, with_effects
+from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.measurement.files.write_session import session_document
 from orthocal.robot.model import Robot
@@ -127,6 +129,19 @@ def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
     with threadpool_limits(1):
         columns = study.run(prepare_once(study), task)
     return {name: _round_column(cells) for name, cells in columns.items()}
+
+
+def require_counts(**counts: int) -> None:
+    """Refuse numbers of cases that are not whole numbers of at least 1.
+
+    Raises:
+        ParameterError: Naming the argument.
+    """
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, Integral) or count < 1:
+            raise ParameterError(
+                f"found {count!r}; expected a whole number of at least 1", where=name
+            )
 
 
 @lru_cache(maxsize=1)

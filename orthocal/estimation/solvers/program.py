@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
@@ -76,6 +77,7 @@ class Program(ABC):
     def __init__(
         self, problem: CalibrationProblem, *, options: SolverOptions | None = None
     ) -> None:
+        require_kind(problem, CalibrationProblem, expected="a CalibrationProblem")
         self.problem = problem
         self.options = options or SolverOptions(solver=self.kind)
 
