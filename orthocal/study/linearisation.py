@@ -269,12 +269,15 @@ class _Prepared:
         return {**errors, **dict.fromkeys(METHODS[3:], general)}
 
 
-def _require_sizes(sizes: Sequence[float]) -> None:
-    """Refuse sizes that are not positive.
+def _require_arguments(source: object, free: object, sizes: Sequence[float]) -> None:
+    """Refuse arguments of `build_linearisation_study` of another kind.
 
     Raises:
-        ParameterError: If there is one.
+        TypeError: If the source or the names are of another kind.
+        ParameterError: If a size is not positive.
     """
+    require_kind(source, (Robot, Session), expected="a Robot or a Session")
+    require_names(free, argument="free")
     for size in sizes:
         if not 0.0 < size < math.inf:
             raise ParameterError(f"found {size}; expected a positive size", where="sizes")
@@ -311,10 +314,8 @@ def build_linearisation_study(
         ParameterError: If nothing can be identified, or a number is invalid.
         RobotError: If the robot cannot be measured by the paper's plan.
     """
-    require_kind(source, (Robot, Session), expected="a Robot or a Session")
-    require_names(free, argument="free")
+    _require_arguments(source, free, [largest, *(() if sizes is None else sizes)])
     require_counts(count=count, directions=directions)
-    _require_sizes([largest, *(sizes or ())])
     robot = source if isinstance(source, Robot) else source.robot
     names = robot.parameters.select(free)
     if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:
