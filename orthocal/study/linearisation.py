@@ -331,7 +331,6 @@ def build_linearisation_study(
         vectors = np.random.default_rng(seed).normal(size=(directions, len(names)))
     else:
         vectors = _read_direction(along, names)
-    # the size of (1, −0.6, 0.3) is its largest component
     unit_vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
     if sizes is None:
         sizes = np.geomspace(largest, min(SMALLEST_SIZE, largest), count)[::-1].tolist()
