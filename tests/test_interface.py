@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 import re
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -241,6 +243,32 @@ def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
 def test_numbers_of_studies(build, arguments, experiment_2):
     with pytest.raises(ParameterError, match=r"expected a (whole number of at least 1|positive)"):
         build(experiment_2, **arguments)
+
+
+@pytest.mark.parametrize("copied", [lambda x: pickle.loads(pickle.dumps(x)), deepcopy])
+def test_sessions_and_calibrations_can_be_pickled(copied, calibration, experiment_2, orthoglide):
+    errors = {"x_slide.offset": 1e-3}
+    values = [
+        simulate_session(s, errors, exact=True).session.values
+        for s in (experiment_2, copied(experiment_2))
+    ]
+    np.testing.assert_array_equal(*values)
+    other = copied(calibration)
+    assert [(p.name, p.value) for p in other] == [*calibration.errors.items()]
+    assert "x_slide.offset" in other and "x_slide" not in other
+    decisions = [c.assessment.decision.to_document() for c in (other, calibration)]
+    assert decisions[0] == decisions[1]
+    robot = copied(orthoglide.with_tolerances({"*.offset_mm": 1.0}))
+    assert robot.parameters.redundant == orthoglide.parameters.redundant
+    posture = orthoglide.reference_passive
+    for got, expected in zip(
+        robot.evaluate_constraints(robot.drive_zero + 1e-3, posture),
+        orthoglide.evaluate_constraints(orthoglide.drive_zero + 1e-3, posture),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(got, expected)
+    with pytest.raises(TypeError):
+        robot.content["orthoglide.yaml"] = b""
 
 
 def test_a_machine_keeps_its_errors(orthoglide):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, get_args
@@ -61,6 +61,12 @@ class Comparison:
     assessments: tuple[Assessment, ...] = ()
     """Assessment of the calibration of each result, as `calibrate` states it; empty unless the
     verdict is `enter`."""
+
+    def __iter__(self) -> Iterator[ModelResult]:
+        return iter(self.results)
+
+    def __contains__(self, model: object) -> bool:
+        return any(r.model == model for r in self.results)
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:

@@ -483,7 +483,7 @@ def _describe_agreement(
             command=command_to_restart(session, session.readings[row]),
         )
         return replace(finding, severity="note") if explained else finding
-    return words.as_predicted(achieved, limit, numbers)
+    return words.as_predicted(achieved, limit, expected, numbers)
 
 
 def _choose_entries(

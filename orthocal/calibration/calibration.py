@@ -6,7 +6,7 @@ It contains everything that reports, scenes and exports need. None of them reads
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +34,12 @@ class Calibration(CalibrationRecord):
     """Nominal robot with the tolerances that the session states."""
     path: Path | None = None
     """File from which it was loaded."""
+
+    def __iter__(self) -> Iterator[ParameterEstimate]:
+        return iter(self.parameters)
+
+    def __contains__(self, name: object) -> bool:
+        return any(p.name == name for p in self.parameters)
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for p in self.parameters:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -222,6 +224,18 @@ class Robot:
     """Chosen effects in addition to geometry and drives; None for those of the YAML."""
     adjusted: bool = False
     """True if placements depend on the mechanical adjustments of each session."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for pickle, without the constraint models, which Pinocchio does not pickle."""
+        state = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "constraints"}
+        return state | {"content": dict(self.content)}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        """Restore a pickled robot, and build its constraint models."""
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "content", MappingProxyType(state["content"]))
+        object.__setattr__(self, "constraints", build_constraints(self.model, self.closures))
 
     @property
     def leg_noun(self) -> str:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from glob import escape, has_magic
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -115,13 +114,13 @@ class ParameterSet:
         self,
         elementary: Iterable[ElementaryError] = (),
         parameters: Iterable[Parameter] = (),
-        models: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        models: Mapping[str, Sequence[str]] | None = None,
         *,
         find_redundant: Callable[[], frozenset[str]] = frozenset,
     ) -> None:
         self.elementary = {e.name: e for e in elementary}
         self._parameters = {p.name: p for p in parameters}
-        self._models = dict(models)
+        self._models = dict(models or {})
         self._find_redundant = find_redundant
         self.defaults: ParameterSet = self
         """Parameters with the tolerances of the robot's YAML."""
@@ -192,7 +191,7 @@ class ParameterSet:
     @cached_property
     def redundant(self) -> frozenset[str]:
         """Elementary errors that neither the tool nor a gauge can observe."""
-        return self._find_redundant()
+        return self._find_redundant() if self.defaults is self else self.defaults.redundant
 
     def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
         """Contribution of one unit of each named parameter to each error, (n_errors, n_names).
@@ -307,12 +306,7 @@ class ParameterSet:
                 stated = without
         if stated == self.stated:
             return self
-        result = ParameterSet(
-            self.elementary.values(),
-            parameters.values(),
-            self._models,
-            find_redundant=lambda: self.redundant,
-        )
+        result = ParameterSet(self.elementary.values(), parameters.values(), self._models)
         result.defaults, result.stated = self.defaults, stated
         return result
 

@@ -389,8 +389,9 @@ def test_number_and_limit_are_printed_differently():
     for achieved, limit, text in (
         (26.4e-6, 25.6e-6, "0.0264 mm RMS (limit 0.0256 mm)"),
         (26e-6, 22e-6, "0.026 mm RMS (limit 0.022 mm)"),
+        (330e-6, 26.3e-3, "0.330 mm RMS (expected 0.208 mm)"),
     ):
-        finding = words.as_predicted(achieved, limit, {})
+        finding = words.as_predicted(achieved, limit, 208e-6, {})
         assert finding.text.endswith(f"by {text}.")
 
 

@@ -17,6 +17,9 @@ RECALIBRATE = "the machine has changed: calibrate this session alone."
 
 RECALIBRATE_PRINTER = "the printer has changed: calibrate this log alone and export its settings."
 
+FAR_LIMIT = 5.0
+"""Factor by which a limit far above any machine's deviations exceeds the expected RMS."""
+
 CALIBRATE_JOINTLY = "Calibrate the sessions together and enter these offsets."
 
 
@@ -72,12 +75,24 @@ def larger_than_predicted(
     return review("larger than predicted", text, action, (place,), **numbers)
 
 
-def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) -> Finding:
-    """Finding about deviations as predicted; arguments as for `larger_than_predicted`."""
+def as_predicted(
+    achieved: float, limit: float, expected: float, numbers: Mapping[str, float]
+) -> Finding:
+    """Finding about deviations as predicted.
+
+    Args:
+        achieved: RMS of the deviations, [m].
+        limit: As for `larger_than_predicted`. Deviations in directions that the calibration hardly
+            predicts have a limit far above any machine's; the expected RMS is stated instead.
+        expected: Predicted RMS, [m].
+        numbers: Numbers of the finding.
+    """
+    deviations = _with_limit(achieved, limit)
+    if limit > FAR_LIMIT * max(achieved, expected):
+        deviations = f"{mm(achieved)} mm RMS (expected {mm(expected)} mm)"
     return note(
         "as predicted",
-        "The new readings agree with the predictions: they deviate by "
-        f"{_with_limit(achieved, limit)}.",
+        f"The new readings agree with the predictions: they deviate by {deviations}.",
         **numbers,
     )
 
