@@ -13,10 +13,12 @@ import pytest
 from orthocal import (
     CalibrationProblem,
     Choice,
+    Gauge,
     LiveScene,
     Machine,
     NonlinearProgram,
     SolverOptions,
+    UseConditions,
     assess,
     assess_tool,
     build_accuracy_study,
@@ -32,10 +34,14 @@ from orthocal import (
     plan_readings,
     reading_table,
     recommend_model,
+    register_effect,
+    register_sensor,
+    restore_session,
     simulate_session,
     summarize,
     validate_calibration,
     write_report,
+    write_session,
 )
 from orthocal.assessment.tool_error import Workspace
 from orthocal.calibration.file import write_calibration
@@ -255,7 +261,8 @@ def test_sessions_and_calibrations_can_be_pickled(copied, calibration, experimen
     np.testing.assert_array_equal(*values)
     other = copied(calibration)
     assert [(p.name, p.value) for p in other] == [*calibration.errors.items()]
-    assert "x_slide.offset" in other and "x_slide" not in other
+    assert "x_slide.offset" in other
+    assert "x_slide" not in other
     decisions = [c.assessment.decision.to_document() for c in (other, calibration)]
     assert decisions[0] == decisions[1]
     robot = copied(orthoglide.with_tolerances({"*.offset_mm": 1.0}))
@@ -320,14 +327,23 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
         (lambda: draw_scene("nonsense"), "expected a Calibration, a Session or a Robot"),
         (lambda: LiveScene(5), "expected a Scene"),
         (lambda: experiment_2.robot.with_errors(5), "errors: found a int; expected a mapping"),
+        (lambda: calibration.machine.inverse(np.zeros(3), conditions="ppp"), "UseConditions"),
+        (lambda: restore_session(experiment_2), "expected a Calibration"),
+        (lambda: write_session(calibration, tmp_path / "s"), "expected a Session"),
+        (lambda: register_sensor("wire"), "expected a class"),
+        (lambda: register_sensor(Gauge), "is not a sensor"),
+        (lambda: register_effect(Gauge), "is not an Effect"),
     ):
         with pytest.raises(TypeError, match=re.escape(message)):
             act()
     for act, message in (
         (lambda: Workspace.even(np.zeros((0, 3))), "found the shape (0, 3); expected points"),
         (lambda: LiveScene(draw_scene(experiment_2), port=10**6), "expected 0 to 65535"),
+        (lambda: Gauge(range=(5e-3, -5e-3)), "expected the lowest and the highest reading"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             act()
+    with pytest.raises(OrthocalError, match="expected 3 letters"):
+        calibration.machine.inverse(np.zeros(3), conditions=UseConditions(5))
     with pytest.raises(OrthocalError, match="file names cannot have"):
         write_calibration(calibration, tmp_path / "a\0b")

@@ -93,7 +93,7 @@ def describe_machine(
 
 def make_robot(
     dimensions: Dimensions,
-    folder: Path,
+    folder: str | Path,
     *,
     counting: Sequence[Counting] | None = None,
     effects: Sequence[str] | EffectKeyValues = (),
@@ -110,6 +110,7 @@ def make_robot(
         RobotError: If the dimensions are impossible, or an effect has no default keys.
         OrthocalError: If the directory cannot be written.
     """
+    folder = Path(folder)
     name = folder.resolve().name
     files = describe_machine(dimensions, name=name, counting=counting, effects=effects)
     write_files(folder, files)

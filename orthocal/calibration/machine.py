@@ -83,6 +83,7 @@ class Machine:
 
     def _closure(self, conditions: UseConditions | None) -> LoopClosure:
         """Loop closures of the machine under conditions of use."""
-        use = conditions or UseConditions()
+        use = UseConditions() if conditions is None else conditions
+        require_kind(use, UseConditions, expected="UseConditions, such as UseConditions('ppp')")
         use.require_valid(self.robot)
         return LoopClosure(self.robot, fixed=self.errors, conditions=use)

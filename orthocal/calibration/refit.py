@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Mask
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
@@ -156,6 +157,7 @@ def restore_session(calibration: Calibration) -> Session:
 
     `repeat_calibration(calibration, restore_session(calibration))` reproduces the calibration.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     record, robot = calibration.session, calibration.robot
     offsets = record.controller_offsets
     return Session(

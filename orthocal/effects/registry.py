@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from orthocal.arguments import require_kind
 from orthocal.effects.protocol import Effect
 from orthocal.errors import OrthocalError
 from orthocal.runtime.registry import Registry
@@ -40,8 +41,13 @@ _EFFECTS = Registry[type[Effect]](GROUP, "effect", _read_effect, BUILT_IN)
 
 
 def register_effect(effect: type[Effect]) -> None:
-    """Register an effect; it replaces an effect of the same name."""
-    _EFFECTS.register(effect.name, effect)
+    """Register an effect; it replaces an effect of the same name.
+
+    Raises:
+        TypeError: If it is no class of an effect.
+    """
+    require_kind(effect, type, expected="a class that is derived from Effect")
+    _EFFECTS.register(getattr(effect, "name", ""), effect)
 
 
 def unregister_effect(name: str) -> None:

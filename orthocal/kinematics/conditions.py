@@ -215,6 +215,7 @@ def stated_use(robot: Robot, use: Use | None = None) -> StatedUse | None:
 
 def find_approach_problem(text: str, robot: Robot) -> str:
     """Text and expectation if an approach is not one letter per drive; else ""."""
+    text = text if isinstance(text, str) else repr(text)
     if len(text) == len(robot.drives) and not text.strip("".join(APPROACH)):
         return ""
     drives = ", ".join(d.name for d in robot.drives)

@@ -36,8 +36,12 @@ class Registry(Generic[Kind]):
         self._built_in = {name: EntryPoint(name, place, group) for name, place in built_in.items()}
 
     def register(self, name: str, kind: Kind) -> None:
-        """Add a kind; it replaces a kind of the same name."""
-        self._registered[name] = kind
+        """Add a kind; it replaces a kind of the same name.
+
+        Raises:
+            TypeError: If the object is invalid.
+        """
+        self._registered[name] = self._read(name, kind)
 
     def unregister(self, name: str) -> None:
         """Remove a kind if it exists."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from orthocal.arguments import require_kind
 from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
 from orthocal.io.fields import As
@@ -27,7 +28,8 @@ GROUP = "orthocal.sensors"
 
 def _read_sensor(name: str, offered: type[Sensor]) -> type[Sensor]:
     """Require that an offered class is a sensor of the kind of its entry point."""
-    if offered.kind != name or not issubclass(offered.keys, SetupKeys):
+    kind, keys = (getattr(offered, attribute, None) for attribute in ("kind", "keys"))
+    if kind != name or not isinstance(keys, type) or not issubclass(keys, SetupKeys):
         raise TypeError(f"{offered.__qualname__} is not a sensor with kind = '{name}' and keys")
     return offered
 
@@ -46,8 +48,13 @@ _SENSORS = Registry[type[Sensor]](GROUP, "sensor", _read_sensor, BUILT_IN)
 
 
 def register_sensor(sensor: type[Sensor]) -> None:
-    """Register a sensor; it replaces a sensor of the same kind."""
-    _SENSORS.register(sensor.kind, sensor)
+    """Register a sensor; it replaces a sensor of the same kind.
+
+    Raises:
+        TypeError: If it is no class of a sensor.
+    """
+    require_kind(sensor, type, expected="a class with the members of Sensor")
+    _SENSORS.register(getattr(sensor, "kind", ""), sensor)
 
 
 def unregister_sensor(kind: str) -> None:

@@ -60,7 +60,7 @@ class Gauge:
         range: Lowest and highest reading, [m].
 
     Raises:
-        ValueError: If `sigma` or `resolution` is not positive.
+        ValueError: If `sigma` or `resolution` is not positive, or the range not two numbers.
     """
 
     sigma: float | None = None
@@ -71,6 +71,10 @@ class Gauge:
         for name, value in (("sigma", self.sigma), ("resolution", self.resolution)):
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name}: found {value!r}; expected a positive number, in m")
+        if self.range is not None and not (len(self.range) == 2 and self.range[0] < self.range[1]):
+            raise ValueError(
+                f"range: found {self.range!r}; expected the lowest and the highest reading, in m"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from orthocal.arguments import require_kind
 from orthocal.effects.compensation import format_table, table_name
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
@@ -198,6 +199,7 @@ def write_session(
     Raises:
         OrthocalError: If the directory is not writable.
     """
+    require_kind(session, Session, expected="a Session, such as load_session(...)")
     folder = Path(folder)
     document = session_document(session)
     document["robot"] = _place_robot(session, folder)
