@@ -59,7 +59,7 @@ def test_the_command_line_knows_it(install, tmp_path):
     [
         ("no_such_module:ToolCoordinate", "ModuleNotFoundError"),
         ("installed_tool:NoSuchClass", "AttributeError"),
-        ("installed_tool:ToolKeys", "AttributeError"),
+        ("installed_tool:ToolKeys", "ToolKeys is not a sensor with kind = 'tool'"),
     ],
 )
 def test_one_that_cannot_be_loaded_gives_one_message(install, tmp_path, value, reason):
