@@ -13,10 +13,12 @@ import pytest
 from orthocal import (
     CalibrationProblem,
     Choice,
+    ElementaryError,
     Gauge,
     LiveScene,
     Machine,
     NonlinearProgram,
+    NuisanceParameter,
     SolverOptions,
     UseConditions,
     assess,
@@ -340,6 +342,9 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
         (lambda: Workspace.even(np.zeros((0, 3))), "found the shape (0, 3); expected points"),
         (lambda: LiveScene(draw_scene(experiment_2), port=10**6), "expected 0 to 65535"),
         (lambda: Gauge(range=(5e-3, -5e-3)), "expected the lowest and the highest reading"),
+        (lambda: NuisanceParameter("tilt", "rad", -1.0), "tilt: prior_std: found -1.0"),
+        (lambda: NuisanceParameter("tilt", "mm", 1.0), "tilt: unit: found 'mm'"),
+        (lambda: ElementaryError("x.play", "play", "x", "m", np.nan), "x.play: prior_std"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             act()

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import casadi as ca
 
 from orthocal.effects.loading import neutral_values, robot_effects
-from orthocal.effects.protocol import Condition, Placement, Symbols, add_twist, condition_size
+from orthocal.effects.protocol import (
+    Condition,
+    Placement,
+    Symbols,
+    add_twist,
+    condition_size,
+    require_expression,
+)
 from orthocal.effects.rods import stretch_rod
 from orthocal.robot.model import Robot
 
@@ -54,11 +61,15 @@ def express_machine(
     for effect in reversed(robot_effects(robot)):  # gain and offset of the drives act last
         parameters = {e.name: elementary[e.name] for e in effect.errors}
         needed: Symbols = {name: stated[name] for name in effect.conditions}
-        actuated = effect.drives(actuated, parameters, needed)
+        source = type(effect).__qualname__
+        moved = effect.drives(actuated, parameters, needed)
+        actuated = require_expression(moved, len(robot.drives), f"{source}.drives")
         displacements = [effect.placements(parameters, needed)]
         for rod, change in effect.rods(parameters, needed).items():
+            change = require_expression(change, 1, f"{source}.rods")
             displacements.append(stretch_rod(robot, robot.rods[rod], change))
         for displacement in displacements:
             for placement, twist in displacement.items():
+                twist = require_expression(twist, 6, f"{source}.placements")
                 add_twist(twists, placement, twist)
     return MachineExpressions(actuated, twists)

@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.errors import OrthocalError
 from orthocal.io.documents import Keys
 from orthocal.robot.frames import Placement as Placement
 from orthocal.robot.model import Robot
@@ -170,6 +171,25 @@ class Effect:
             Reading with this effect, [m].
         """
         return reading
+
+
+def require_expression(value: object, rows: int, source: str) -> ca.SX:
+    """Check what a method of a sensor or an effect returns.
+
+    Args:
+        value: The returned value.
+        rows: Expected number of rows.
+        source: The method, for the message.
+
+    Raises:
+        OrthocalError: If it is no column of expressions of this size.
+    """
+    if isinstance(value, ca.SX) and value.shape == (rows, 1):
+        return value
+    found = f"the shape {value.shape}" if isinstance(value, ca.SX) else type(value).__name__
+    raise OrthocalError(
+        f"{source} returns {found}; expected an expression (casadi.SX) of shape ({rows}, 1)"
+    )
 
 
 def add_twist(twists: dict[Placement, ca.SX], placement: Placement, twist: ca.SX) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from orthocal.arguments import require_numbers
 from orthocal.errors import ParameterError
 from orthocal.text import composed
-from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit, tidy
+from orthocal.units import EDGE_UNITS, UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit, tidy
 
 COMPLETE: Literal["complete"] = "complete"
 """Keyword for a model of all observable errors."""
@@ -36,6 +36,18 @@ SMALLEST_PRIOR_STD = 1e-9
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
+
+
+def require_prior(name: str, unit: str, std: float) -> None:
+    """Check unit and prior standard deviation of a parameter.
+
+    Raises:
+        ValueError: Naming the parameter.
+    """
+    if unit not in EDGE_UNITS:
+        raise ValueError(f"{name}: unit: found {unit!r}; expected one of {', '.join(EDGE_UNITS)}")
+    if not 0.0 <= std < math.inf:
+        raise ValueError(f"{name}: prior_std: found {std!r}; expected a number of at least 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +67,9 @@ class ElementaryError:
             complete model, unless they are redundant. Those of named effects are part of every
             model.
         positive: True for a value of at least 0 with a half-normal prior.
+
+    Raises:
+        ValueError: If the unit is unknown, or the standard deviation no number of at least 0.
     """
 
     name: str
@@ -66,6 +81,9 @@ class ElementaryError:
     axis: int = -1
     complete: bool = True
     positive: bool = False
+
+    def __post_init__(self) -> None:
+        require_prior(self.name, self.unit, self.prior_std)
 
 
 @dataclass(frozen=True, slots=True)

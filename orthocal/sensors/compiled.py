@@ -15,7 +15,13 @@ import casadi as ca
 import numpy as np
 
 from orthocal.effects.loading import reading_effects
-from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
+from orthocal.effects.protocol import (
+    NEUTRAL,
+    Condition,
+    Symbols,
+    condition_size,
+    require_expression,
+)
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.function_cache import (
@@ -90,7 +96,7 @@ class _Pattern:
         self.robot, self.sensor, self.frames = robot, sensor, frames
         self.conditions = reading_conditions(robot, sensor)
         sizes = (condition_size(robot, c) for c in self.conditions)
-        self.n_constants = sensor.constants(robot).size + sum(sizes)
+        self.n_constants = np.size(sensor.constants(robot)) + sum(sizes)
         effect_errors = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
         self.nuisance_parameters = (*(u.name for u in sensor.nuisance_parameters), *effect_errors)
         self._key = (
@@ -264,10 +270,14 @@ def express_reading(
     first = len(sensor.nuisance_parameters)
     seen: dict[str, ca.SX] = {c: conditions[c] for c in sensor_conditions(sensor)}
     view = View(frames, at_zero, values[0], nuisance[:first], seen, second)
-    reading = sensor.expression(view, robot)
+    reading = require_expression(
+        sensor.expression(view, robot), 1, f"{type(sensor).__qualname__}.expression"
+    )
     for effect in reading_effects(robot):
         errors = {e.name: nuisance[first + i] for i, e in enumerate(effect.setup_errors)}
-        reading = effect.reading(reading, errors, {c: conditions[c] for c in effect.conditions})
+        needed: Symbols = {c: conditions[c] for c in effect.conditions}
+        changed = effect.reading(reading, errors, needed)
+        reading = require_expression(changed, 1, f"{type(effect).__qualname__}.reading")
         first += len(errors)
     return reading
 

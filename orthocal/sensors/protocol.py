@@ -21,6 +21,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
+from orthocal.robot.parameters import require_prior
 from orthocal.units import InUnit, Unit
 
 GaugeZero = Literal["free", "known"]
@@ -41,7 +42,11 @@ LARGEST_READING = 0.3
 
 @dataclass(frozen=True, slots=True)
 class NuisanceParameter(InUnit):
-    """Error of a sensor or its mounting that is estimated together with the machine."""
+    """Error of a sensor or its mounting that is estimated together with the machine.
+
+    Raises:
+        ValueError: If the unit is unknown, or the standard deviation no number of at least 0.
+    """
 
     name: str
     """Name that is unique within its setup, or within the setups that share the parameter."""
@@ -55,6 +60,9 @@ class NuisanceParameter(InUnit):
     """True if all setups with the same gauge share the parameter."""
     nominal: float = 0.0
     """Nominal value of the quantity, [unit]; setups that share the parameter must agree in it."""
+
+    def __post_init__(self) -> None:
+        require_prior(self.name, self.unit, self.prior_std)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

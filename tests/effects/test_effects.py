@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -29,7 +30,7 @@ from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.rods import stretch_rod
-from orthocal.errors import ParameterError, RobotError, SessionError
+from orthocal.errors import OrthocalError, ParameterError, RobotError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
@@ -41,6 +42,7 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.joining import join_sessions
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
+from orthocal.robot.frames import Placement
 from orthocal.sensors.compiled import reading_conditions
 from orthocal.session.session import Conditions
 
@@ -140,6 +142,24 @@ def test_a_parameter_of_another_effect_is_refused(tmp_path):
     finally:
         registry.unregister_effect("other")
     assert caught.value.where.endswith("orthocal.effects.other")
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "message"),
+    [
+        ("drives", ca.SX(2, 1), "Wrong.drives returns the shape (2, 1); expected"),
+        ("drives", np.zeros(3), "Wrong.drives returns ndarray; expected"),
+        ("placements", {Placement(1, False): ca.SX(3, 1)}, "of shape (6, 1)"),
+        ("rods", {("x_leg", "a"): 0.1}, "Wrong.rods returns float; expected"),
+        ("reading", ca.SX(3, 1), "Wrong.reading returns the shape (3, 1); expected"),
+    ],
+)
+def test_what_is_no_expression_of_its_shape_is_named(tmp_path, method, returned, message):
+    wrong = type("Wrong", (Slack,), {method: lambda *_: returned})
+    registry.register_effect(wrong)
+    folder = write_plan(tmp_path / "plan", effects="slack: {}")
+    with pytest.raises(OrthocalError, match=re.escape(message)):
+        predict_readings(load_plan(folder), {})
 
 
 def test_effects_of_installed_packages_are_found(tmp_path, monkeypatch, root):

@@ -98,6 +98,21 @@ def test_its_readings_are_those_of_the_tool(plan):
         assert np.abs(found[own] - expected).max() < 1e-12
 
 
+def test_a_reading_of_another_shape_is_refused(plan):
+    class Vector(ToolCoordinate):
+        def expression(self, view, robot):
+            return view.frames[0].position
+
+    setups = {
+        name: replace(s, sensor=Vector(s.sensor.axis, s.sensor.slope_tolerance, None))
+        for name, s in plan.setups.items()
+        if s.sensor.kind == "tool"
+    }
+    readings = tuple(r for r in plan.readings if r.setup in setups)
+    with pytest.raises(OrthocalError, match=r"Vector.expression returns the shape \(3, 1\)"):
+        predict_readings(replace(plan, setups=setups, readings=readings), {})
+
+
 def test_nuisance_parameters_are_identified_with_the_machine(plan):
     """Slopes of 2 and 3 in a thousand at 0.16 m of travel, read to 2 µm: known to about 1e-5."""
     simulated = simulate_session(plan, TRUTH, seed=4)
