@@ -16,13 +16,18 @@ from typing import Self
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 
 from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols
 from orthocal.io.documents import PositiveNumber
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.frames import carriers
-from orthocal.robot.model import Robot, joint_axis
+from orthocal.robot.model import Closure, Robot, joint_axis
 from orthocal.robot.parameters import AXES, ElementaryError
 from orthocal.units import MM, MRAD, read_limit
+
+SMALLEST_TURN = 1e-6
+"""Turn of two frames against each other that is not a rounding error, [rad/m, rad/rad]."""
 
 
 class GeometryTolerances(EffectKeys):
@@ -78,10 +83,10 @@ def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[Elementary
 
 def _frame_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:
     """Errors of the placements of all frames in use."""
-    complete = _loop_frames(robot)
+    complete = _of_complete_model(robot)
     for frame in robot.frames:
         for axis in range(6):
-            yield _error(frame, axis, keys, complete=frame in complete, of_frame=True)
+            yield _error(frame, axis, keys, complete=axis in complete[frame], of_frame=True)
 
 
 def _error(
@@ -102,12 +107,40 @@ def _error(
     )
 
 
-def _loop_frames(robot: Robot) -> frozenset[str]:
-    """Frames of closures, except those that carry the tool.
+def _of_complete_model(robot: Robot) -> dict[str, range]:
+    """Components of the twist of each frame that belong to the complete model.
 
-    Their errors belong to parts of the machine. An error of a frame that carries the tool only
-    moves the tool on the platform.
+    Frames of closures are ends of links, such as rods. If such a frame carries the tool and its
+    partner does not turn against it, its errors are those of the partner and move the tool on its
+    link. Otherwise its translation changes a length of its link. Its rotation matters only to
+    closures that constrain rotations.
     """
     tool = set(carriers(robot.model, robot.frame_id(robot.tcp.frame))) if robot.tcp else set()
-    ends = {frame for c in robot.closures for frame in (c.frame_a, c.frame_b)}
-    return frozenset(frame for frame in ends if robot.frame_id(frame) not in tool)
+    complete = dict.fromkeys(robot.frames, range(0))
+    for closure in robot.closures:
+        for frame in (closure.frame_a, closure.frame_b):
+            parts = range(6)
+            if robot.frame_id(frame) in tool:
+                size = 3 if closure.kind == "3d" else 6
+                parts = range(size if _turns(robot, closure) else 0)
+            complete[frame] = max(complete[frame], parts, key=len)
+    return complete
+
+
+def _turns(robot: Robot, closure: Closure) -> bool:
+    """True if the frames of a closure turn against each other as the drives begin to move."""
+    model, coordinates = robot.model, robot.reference_posture
+    data = model.createData()
+    pin.computeJointJacobians(model, data, robot.configuration(coordinates))
+    pin.updateFramePlacements(model, data)
+    first, second = (
+        pin.getFrameJacobian(
+            model, data, robot.frame_id(frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )[3:]
+        for frame in (closure.frame_a, closure.frame_b)
+    )
+    _, g = robot.evaluate_constraints_at(coordinates)
+    drives, passive = robot.drive_index.tolist(), robot.passive_index.tolist()
+    following = np.linalg.lstsq(g[:, passive], -g[:, drives], rcond=RANK_TOLERANCE)[0]
+    turn = (second - first)[:, drives] + (second - first)[:, passive] @ following
+    return bool(np.abs(turn).max(initial=0.0) > SMALLEST_TURN)

@@ -293,6 +293,16 @@ class Robot:
         """
         return find_frame(self.model, name, where=str(self.yaml))
 
+    def reference_pose(self, name: str) -> pin.SE3:
+        """Pose of a frame in the reference posture, in the world frame.
+
+        Raises:
+            RobotError: If there is no such frame.
+        """
+        data = self.model.createData()
+        pin.forwardKinematics(self.model, data, self.configuration(self.reference_posture))
+        return pin.updateFramePlacement(self.model, data, self.frame_id(name))
+
     def placement_of(self, error: ElementaryError) -> Placement:
         """Placement that an error of a joint or frame displaces."""
         if error.of_frame:

@@ -1,9 +1,11 @@
 """Indicator at the tool, on a straightedge, a square, a surface plate or a gauge block.
 
 The artefact is clamped to the table. Its surface is a plane with normal n, nominally the direction
-d of the plunger. The tip q and the plunger's direction u move with the tool:
+d of the plunger in the reference posture. The tip q and the plunger's direction u move with the
+tool. Where the zero is free, q₀ is the tip in the reference posture of the nominal machine, else
+the origin of the world frame:
 
-    h = (1 + s) ((n · q + H) / (n · u) + f(q))
+    h = (1 + s) ((n · (q - q₀) + H) / (n · u) + f(q))
 
 s is the scale error of the dial. H is the height of a gauge block under the tip, and 0 beside the
 block. Yaw, about the axis square to artefact and plunger, and roll, about the artefact, turn n. f
@@ -40,6 +42,7 @@ from orthocal.sensors.protocol import (
     SetupKeys,
     ToolSensor,
     View,
+    default_zero,
 )
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
 
@@ -137,7 +140,8 @@ class ToolIndicatorKeys(SetupKeys):
     """Keys of a setup with an indicator at the tool, as in a session.yaml."""
 
     direction: Literal["x", "y", "z", "-x", "-y", "-z"]
-    """Direction of the plunger; the reading grows when the tool moves in this direction."""
+    """Direction of the plunger in the reference posture, in the world frame; the reading grows when
+    the tool moves in this direction."""
     artefact: ArtefactKeys
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Tip of the plunger at reading 0, from the tool centre point, in the tool's frame."""
@@ -291,13 +295,15 @@ class ToolIndicator(ToolSensor):
         return Frames((require_tcp(robot).frame,))
 
     def constants(self, robot: Robot) -> Array:
-        """Constants of the expression, shape (17,), [m].
+        """Constants of the expression, shape (26,), [m].
 
         Directions of plunger (3) and artefact (3), axis of yaw (3), position of the tip (3), half
         length (1), share of a square's error in the yaw (1), sign of the form errors (1), height of
-        a block (1), and coordinate of the plane along the plunger (1).
+        a block (1), coordinate of the plane along the plunger (1), direction of the plunger in the
+        tool's frame (3), position of the tool centre point in the reference posture of the nominal
+        machine (3), and a point of the surface (3).
         """
-        del robot
+        zero = robot.reference_pose(require_tcp(robot).frame)
         a = self.artefact
         d, along = direction_vector(self.direction), self._along
         square_to_both = np.abs(np.cross(along, d))
@@ -307,7 +313,11 @@ class ToolIndicator(ToolSensor):
         share = sign * (-0.5 if is_first_arm else 0.5) * (a.kind == "square")
         level = a.table * float(d.sum())
         numbers = [0.5 * a.length, share, sign, a.height, level]
-        return np.array([*d, *along, *square_to_both, *self.tool, *numbers])
+        fixed = zero.rotation.T @ d
+        tip = zero.translation + zero.rotation @ np.array(self.tool)
+        point = tip if default_zero(self) == "free" else np.zeros(3)
+        places = [*fixed, *zero.translation, *point]
+        return np.array([*d, *along, *square_to_both, *self.tool, *numbers, *places])
 
     @property
     def dimensions(self) -> Mapping[str, Sensor]:
@@ -356,6 +366,7 @@ class ToolIndicator(ToolSensor):
         c = view.constants
         plunger, along, across, tip = (c[i : i + 3] for i in (0, 3, 6, 9))
         half, share, sign, height, level = (c[i] for i in range(12, 17))
+        fixed, zero, point = (c[i : i + 3] for i in (17, 20, 23))
         (tool,) = view.frames
         q = tool.position + tool.rotation @ tip
         yaw = errors.get("yaw", 0.0) + share * errors.get("square", 0.0)
@@ -363,8 +374,9 @@ class ToolIndicator(ToolSensor):
         on_block = level - ca.dot(plunger, tool.position) > 0.5 * height
         block = ca.if_else(on_block, height + errors.get("height", 0.0), 0.0)
         block = ca.if_else(height > 0.0, block, 0.0)
-        form = sign * _form(errors, ca.dot(along, q) / half, ca.dot(across, q) / half)
-        reading = (ca.dot(normal, q) + block) / ca.dot(normal, tool.rotation @ plunger) + form
+        s, t = (ca.dot(axis, q - zero) / half for axis in (along, across))
+        distance = ca.dot(normal, q - point) + block
+        reading = distance / ca.dot(normal, tool.rotation @ fixed) + sign * _form(errors, s, t)
         return ca.SX((1.0 + errors.get("scale", 0.0)) * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:

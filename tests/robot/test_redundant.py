@@ -74,6 +74,15 @@ def test_the_complete_model_has_no_redundant_errors(orthoglide):
     )
 
 
+def test_both_rods_have_their_length_if_the_tool_hangs_below_the_end_of_one(biglide):
+    """The tool is the end of rod x: a longer rod moves it, and no other error does the same."""
+    assert biglide.tcp.frame == "x_tip"
+    complete = set(biglide.parameters.complete)
+    assert {"frame.x_tip.x", "frame.y_tip.x"} <= complete
+    # a rotation of the frame only turns the tool
+    assert not complete & {f"frame.x_tip.r{axis}" for axis in "xyz"}
+
+
 def test_without_observations_no_error_is_redundant(fivebar, biglide):
     assert fivebar.parameters.redundant == frozenset()
     # two drives on one rail each: only what leaves the plane is taken up by nothing

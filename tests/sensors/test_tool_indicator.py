@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from bounds import bound_um
 from calibrated import identified
+from conftest import ROOT
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
@@ -13,6 +16,7 @@ from tolerances import CLOSED_FORM
 
 from orthocal import (
     load_plan,
+    load_robot,
     load_session,
     simulate_session,
     write_session,
@@ -139,7 +143,8 @@ def touch(machine, drives, tool, sensor, errors):
     system = np.column_stack([u, corners[1], corners[2]])
     # a block lifts the plane along its normal
     normal = turn.apply(d)
-    h = np.linalg.solve(system, q - normal * (normal @ (turn.apply(lifted))))[0]
+    at_zero = np.array(sensor.tool)  # the plane contains the tip in the mechanical zero
+    h = np.linalg.solve(system, q - at_zero - normal * (normal @ (turn.apply(lifted))))[0]
     s, t = along @ q / (0.5 * a.length), third @ q / (0.5 * a.length)
     p2, p3 = np.polynomial.legendre.Legendre.basis(2), np.polynomial.legendre.Legendre.basis(3)
     forms = {
@@ -169,6 +174,39 @@ def test_readings_are_where_rays_meet_planes(tmp_path):
         sensor, drives = plan.setups[r.setup].sensor, plan.postures[r.posture].drives
         expected = touch(machine, drives, tool, sensor, errors)
         assert abs(found[row] - expected) < CLOSED_FORM, (r.setup, r.posture)
+
+
+def test_a_tool_that_turns_reads_along_its_plunger(tmp_path):
+    """The tool of this biglide turns with a rod, its frame is oblique, its zero off the origin."""
+    folder = shutil.copytree(ROOT / "tests/robots/biglide", tmp_path / "biglide")
+    urdf, place = folder / "biglide.urdf", 'xyz="0.1 0.05 0"'
+    text = urdf.read_text().replace('xyz="-0.2 0 0"', 'xyz="-0.2 0 0" rpy="0 0 0.4"', 1)
+    text = text.replace('<child link="x_slider"/>', f'<child link="x_slider"/> <origin {place}/>')
+    urdf.write_text(text.replace("<origin rpy", f"<origin {place} rpy"))
+    robot = load_robot(folder)
+    zero = frame_pose(robot, robot.drive_zero, "x_tip")
+    offsets = [(x, y) for x in (-30.0, 0.0, 30.0) for y in (0.0, 10.0)]
+    points = [1e3 * zero.translation[:2] + offset for offset in offsets]
+    postures = "".join(f"  p{i}: {{tcp_mm: {p.tolist()}}}\n" for i, p in enumerate(points))
+    setups = "".join(
+        f"  {kind}: {{sensor: tool_indicator, direction: {d}, tool_mm: [4, 0, 0], "
+        f"artefact: {{kind: {kind}{more}}}}}\n"
+        for kind, d, more in (("straightedge", "y", ", along: x"), ("plate", "-y", ""))
+    )
+    text = f"robot: {folder}\ngauge: {{sigma_mm: 0.005}}\n"
+    (tmp_path / "plan.yaml").write_text(f"{text}postures:\n{postures}setups:\n{setups}")
+    plan = load_plan(tmp_path / "plan.yaml")
+    tip_at_zero, turned = zero.act(np.array([4e-3, 0.0, 0.0])), []
+    for reading, found in zip(plan.readings, predict_readings(plan, {}), strict=True):
+        normal = np.array([0.0, 1.0 if reading.setup == "straightedge" else -1.0, 0.0])
+        pose = frame_pose(robot, plan.postures[reading.posture].drives, "x_tip")
+        turn = pose.rotation @ zero.rotation.T
+        distance = normal @ (pose.act(np.array([4e-3, 0.0, 0.0])) - tip_at_zero)
+        turned.append(normal @ turn @ normal)
+        assert abs(found - distance / turned[-1]) < CLOSED_FORM
+    assert np.abs(zero.translation).max() > 0.05
+    assert zero.rotation[0, 1] < -0.3
+    assert min(turned) < 0.999
 
 
 def test_arms_of_a_square_share_its_yaw_until_it_is_turned_over(tmp_path):
