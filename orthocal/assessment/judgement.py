@@ -21,7 +21,7 @@ from orthocal.assessment.plausibility import (
     find_implausible,
     find_impossible_gauges,
 )
-from orthocal.assessment.repeated_readings import find_scattered
+from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import (
     describe_anomalies,
@@ -214,7 +214,7 @@ def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list
     if impossible := list(find_impossible_gauges(session)):
         return impossible
     findings = describe_anomalies(session, anomalies or find_anomalies(session))
-    return findings or list(find_scattered(session))
+    return findings or [*find_scattered(session), *find_exchanged_sides(session)]
 
 
 def find_tolerance_scale(session: Session) -> ToleranceScale:

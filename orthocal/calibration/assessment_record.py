@@ -49,6 +49,7 @@ FindingKind = Literal[
     "change unknown",
     "wrong order",
     "scattered repeats",
+    "sides exchanged",
     "differing closing reading",
     "readings missing",
     "no anomaly",

@@ -1,25 +1,31 @@
-"""Closing readings that differ from the first readings of their setups."""
+"""Closing readings that differ from the first ones, and exchanged sides of approach."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from conftest import ROOT
 from models import TRUTH
 from planned import quick_plan
 
 from orthocal import (
     calibrate,
     check_session,
+    draw_errors,
     join_sessions,
+    load_plan,
     load_session,
     simulate_session,
     write_session,
 )
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.repeated_readings import find_scattered
+from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
+from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.weighting import usual_difference
 from orthocal.hypotheses.hypothesis import Rows
-from orthocal.session.session import Gauge
+from orthocal.session.session import Conditions, Gauge
 
 KIND = "differing closing reading"
 
@@ -120,3 +126,59 @@ def test_the_setup_is_read_again_unless_other_offsets_are_active(sound, tmp_path
         (finding,) = check_session(session).of_kind(KIND)
         assert (f"type `restart {line}`" in finding.action) == again
         assert ("omit the setup" in finding.action) != again
+
+
+BACKLASHES = {"x_slide.backlash": 40e-6, "y_slide.backlash": 55e-6, "z_slide.backlash": 30e-6}
+
+
+@pytest.fixture(scope="module")
+def sided():
+    """Function from a seed to sound readings from both sides."""
+    plan = load_plan(ROOT / "examples/raw-cycles/plan.yaml").with_effects(["backlash"])
+    readings = tuple(
+        replace(r, conditions=Conditions(approach=3 * side))
+        for r in plan.readings
+        if r.cycle == 1
+        for side in "pn"
+    )
+    plan = replace(plan.with_controller(np.zeros(3)), readings=readings)
+    plan = plan.with_gauge(Gauge(5e-6, 1e-5))
+
+    def simulate(seed):
+        errors = draw_errors(plan.robot, ["*"], seed=seed, tolerances={"*.offset_mm": 4.0})
+        return simulate_session(plan, errors | BACKLASHES, seed=seed).session
+
+    return simulate
+
+
+def with_exchanged_sides(session, setups):
+    turned = str.maketrans("pn", "np")
+    readings = tuple(
+        replace(r, conditions=replace(r.conditions, approach=r.approach.translate(turned)))
+        if r.setup in setups
+        else r
+        for r in session.readings
+    )
+    return replace(session, readings=readings)
+
+
+@pytest.mark.parametrize("which", [slice(None), slice(0, 1), slice(1, 2)], ids=["all", "1", "2"])
+def test_exchanged_sides_are_named_with_their_setups(sided, which):
+    session = sided(3)
+    setups = list(session.setups)[which]
+    (finding,) = find_exchanged_sides(with_exchanged_sides(session, setups))
+    assert {p.setup for p in finding.places} <= set(setups)
+    assert all(name in finding.text for name in setups)
+    assessment = check_session(with_exchanged_sides(session, setups))
+    assert assessment.decision.verdict == "review"
+
+
+def test_sides_of_sound_sessions_are_not_exchanged(sided):
+    """Also where the controller compensates too much, or nothing is left of the backlash."""
+    for seed in range(20):
+        session = sided(seed)
+        assert find_exchanged_sides(session) == ()
+        trims = tuple(JointTrim(v + 10e-6) for v in BACKLASHES.values())
+        plan = replace(session, compensation=trims)
+        errors = draw_errors(plan.robot, ["*.offset"], seed=seed) | BACKLASHES
+        assert find_exchanged_sides(simulate_session(plan, errors, seed=seed).session) == ()
