@@ -206,11 +206,11 @@ class _Differences:
 
 def _find_exchanged(setups: Sequence[_Differences], session: Session) -> Sequence[_Differences]:
     """Setups whose sides are exchanged."""
-    from scipy.optimize import nnls
-
     count = len(setups)
     if not count:
         return []
+    from scipy.optimize import nnls
+
     stds = [session.robot.parameters[name].prior_std for name in _backlashes(session)]
     values = np.concatenate([*(d.values for d in setups), np.zeros(len(stds))])
     as_stated = np.ones(count)

@@ -69,8 +69,7 @@ def export(
             by commas, mm or degrees; without it the files contain changes only.
         latched (SIGNS): linuxcnc: sign of HOME_LATCH_VEL of each joint, such as +,+,-; it matters
             for drives with backlash. Default: + for all joints.
-        ini (FILE): linuxcnc: INI file during the measurement, instead of --home-offset and
-            --latched.
+        ini (FILE): linuxcnc: INI file during the measurement: HOME_OFFSET, latching, soft limits.
     """
     result = orthocal.load_calibration(calibration)
     stated = {"--home-offset": home_offset, "--latched": latched}
@@ -78,8 +77,9 @@ def export(
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
-        home_offsets=_home_offsets(home_offset, result) if joints is None else joints.home_offsets,
-        latched=_signs(latched) if joints is None or joints.latched is None else joints.latched,
+        home_offsets=joints.home_offsets if joints else _home_offsets(home_offset, result),
+        latched=(joints.latched if joints else None) or _signs(latched),
+        joint_limits=joints.limits if joints else None,
         half_side=None if half_side_mm is None else half_side_mm * MM,
         payload=payload,
         module=module,

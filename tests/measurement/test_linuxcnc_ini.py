@@ -84,6 +84,7 @@ def test_a_machine_without_compensation_has_none(folder, orthoglide):
         ("HOME_OFFSET = 340", "HOME_OFFSET = 340,0", "[JOINT_1]"),
         ("BACKLASH = 0.031", "BACKLASH = -0.031", "[JOINT_0]"),
         ("COMP_FILE_TYPE = 1", "COMP_FILE_TYPE = 0", "[JOINT_2]"),
+        ("BACKLASH = 0.2", "MIN_LIMIT = 70\nMAX_LIMIT = -150", "[JOINT_2]"),
     ],
 )
 def test_wrong_files_are_refused(folder, orthoglide, old, new, where):
@@ -141,6 +142,24 @@ def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
     twice = export(folder, one, "twice", "--ini", plain, "--latched", "+,+,+")
     assert twice.returncode == 2
     assert "--latched" in twice.stderr
+
+
+def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
+    """They are positions of the slide, which change with the offset; wider ones do not count."""
+    own = "[JOINT_1]\nMIN_LIMIT = 160\nMAX_LIMIT = 999\n"
+    (folder / "narrow.ini").write_text(plain.read_text().replace("[JOINT_1]\n", own))
+    limits = []
+    for name in ("plain", "narrow"):
+        assert export(folder, one, name, "--ini", folder / f"{name}.ini").returncode == 0
+        text = (folder / name / "joints.ini").read_text()
+        found = re.findall(r"^(?:MIN|MAX)_LIMIT = (\S+)", text, re.M)
+        limits.append(np.array(found, dtype=float).reshape(3, 2))
+    change = limits[1] - limits[0]
+    assert limits[0][1] == pytest.approx((120.0, 390.0), abs=1.0)
+    offset = limits[0][1, 0] - 120.0
+    assert limits[1][1, 0] == pytest.approx(160.0 + offset, abs=1e-3)
+    change[1, 0] = 0.0
+    assert not change.any()
 
 
 def test_latching_is_positive_by_default_and_said_to_be(folder, one, plain):

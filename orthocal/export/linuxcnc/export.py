@@ -39,6 +39,7 @@ OPTIONS = {
     "tool": "--tool",
     "home_offsets": "--home-offset",
     "latched": "--latched",
+    "joint_limits": "--ini",
     "half_side": "--half-side-mm",
     "payload": "--payload",
     "module": "--module or --offsets",
@@ -66,6 +67,9 @@ class ExportOptions:
     latched: tuple[int, ...] | None = None
     """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 1 by default. It has an effect with backlash
     only."""
+    joint_limits: tuple[tuple[float, float], ...] | None = None
+    """MIN_LIMIT and MAX_LIMIT of each joint during the measurement, [m, rad]. The travel of the
+    robot limits them too."""
     half_side: float | None = None
     """Half the side of the module's region around the mechanical zero, [m]."""
     payload: float | None = None
@@ -119,7 +123,9 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         compensation = compensate_with_offsets(calibration, options.latched)
         _require_change(calibration, compensation, before)
         _require_home_offsets(options, [*before, *compensation])
-        homes = find_homes(calibration, compensation, before, old=options.home_offsets)
+        homes = find_homes(
+            calibration, compensation, before, options.home_offsets, options.joint_limits
+        )
         return {
             "README.md": write_home_page(calibration, homes, stated=stated),
             "joints.ini": write_home_lines(calibration, homes, stated=stated),
@@ -130,7 +136,9 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     compensation = round_backlash(compensation, before)
     if not compensates_alike(compensation, before):
         _require_home_offsets(options, before)
-    homes = find_homes(calibration, compensation, before, old=options.home_offsets)
+    homes = find_homes(
+        calibration, compensation, before, options.home_offsets, options.joint_limits
+    )
     approximation = approximate(
         calibration,
         within=DEFAULT_TOLERANCE if options.within is None else options.within,

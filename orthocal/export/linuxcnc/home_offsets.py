@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
@@ -93,8 +94,8 @@ def find_homes(
     calibration: Calibration,
     compensation: Sequence[JointCompensation],
     before: Sequence[JointCompensation],
-    *,
     old: Sequence[float] | None = None,
+    stated_limits: Sequence[tuple[float, float]] | None = None,
 ) -> tuple[JointHome, ...]:
     """HOME_OFFSET and limits of each drive's joint, in the order of the drives.
 
@@ -103,6 +104,8 @@ def find_homes(
         compensation: New compensation of each joint by the controller.
         before: Compensation during the measurement.
         old: HOME_OFFSET of each joint during the measurement, [m, rad].
+        stated_limits: Soft limits of each joint during the measurement, [m, rad]. The narrower ones
+            of these and of the robot's travel count.
 
     Raises:
         ParameterError: If the numbers of old values and drives differ.
@@ -119,10 +122,9 @@ def find_homes(
     active = calibration.session.controller_offsets
     homes = []
     for i, d in enumerate(drives):
-        limits = None
+        limits = None if stated_limits is None else stated_limits[i]
         if active is not None:
-            lowest, highest = np.array(d.joint_limits) + d.direction * active[i]
-            limits = float(lowest), float(highest)
+            limits = _intersect(np.array(d.joint_limits) + d.direction * active[i], limits)
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
         home, joint = None if old is None else old[i], compensation[i]
         home_changes = [0.0, 0.0]
@@ -147,3 +149,9 @@ def find_homes(
             )
         )
     return tuple(homes)
+
+
+def _intersect(travel: Array, stated: tuple[float, float] | None) -> tuple[float, float]:
+    """Limits that a joint's travel, shape (2,), and its stated limits have in common, [unit]."""
+    low, high = stated or (-np.inf, np.inf)
+    return max(float(travel[0]), low), min(float(travel[1]), high)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ class ControllerJoints:
 
     home_offsets: tuple[float, ...]
     """HOME_OFFSET, [m, rad]."""
+    limits: tuple[tuple[float, float], ...]
+    """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
     latched: tuple[int, ...] | None
     """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
     compensation: Compensation
@@ -59,6 +62,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     if units not in METRIC_UNITS:
         raise ParameterError(f"LINEAR_UNITS is {units}; expected mm", where=f"{path}: [TRAJ]")
     homes, latched, trims = list[float](), list[int | None](), list[JointTrim]()
+    limits = list[tuple[float, float]]()
     for i, drive in enumerate(robot.drives):
         where = f"{path}: [JOINT_{i}]"
         keys = sections.get(f"JOINT_{i}")
@@ -68,11 +72,13 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
             )
         home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
         homes.append(home)
+        limits.append(_read_limits(keys, drive, where))
         latched.append(latch)
         trims.append(trim)
     stated = any(latch is not None for latch in latched)
     return ControllerJoints(
         tuple(homes),
+        tuple(limits),
         tuple(latch or 1 for latch in latched) if stated else None,
         tuple(trims),
         None if stated else _read_offsets(path, len(robot.drives)),
@@ -129,6 +135,24 @@ def _read_joint(
     if "HOME_LATCH_VEL" in keys:
         latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
     return numbers["HOME_OFFSET"] * factor, latch, JointTrim(numbers["BACKLASH"] * factor, table)
+
+
+def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[float, float]:
+    """MIN_LIMIT and MAX_LIMIT of a joint, [m, rad]; infinite if not stated.
+
+    Raises:
+        ParameterError: If one is no number, or the lowest is above the highest.
+    """
+    unit, factor = DRIVE_UNITS[drive.unit]
+    low, high = (
+        parse_number(keys[key], where=where, name=key, error=ParameterError) if key in keys else end
+        for key, end in (("MIN_LIMIT", -math.inf), ("MAX_LIMIT", math.inf))
+    )
+    if low >= high:
+        raise ParameterError(
+            f"MIN_LIMIT is {low:g} {unit}, not below MAX_LIMIT, {high:g} {unit}", where=where
+        )
+    return low * factor, high * factor
 
 
 def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
