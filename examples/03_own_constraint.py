@@ -28,9 +28,12 @@ solver = ca.nlpsol(
     {"ipopt": {"print_level": 0, "sb": "yes"}, "print_time": False},
 )
 sigma = orthocal.calibrate(session, choice).noise.sigma
+lower, upper = program.variable_bounds()
 found = solver(
     x0=program.initial_variables(sigma=sigma),
     p=program.parameter_values(sigma=sigma),
+    lbx=lower,
+    ubx=upper,
     lbg=0.0,
     ubg=0.0,
 )

@@ -169,7 +169,7 @@ class NonlinearProgram(Program):
     def _run(self, data: SolverInput, width_factor: float = 1.0) -> Solution:
         """Run Ipopt once, with a multiple of the width of a robust loss."""
         problem, sigma, prescribed = self.problem, data.sigma, data.prescribed
-        lower, upper = self._bounds(prescribed)
+        lower, upper = self.variable_bounds(prescribed)
         theta = np.clip(
             data.start,
             lower[: self._n_theta] * problem.theta_scale,
@@ -362,13 +362,17 @@ class NonlinearProgram(Program):
             },
         )
 
-    def _bounds(self, prescribed: Mapping[int, float]) -> tuple[Array, Array]:
-        """Scaled bounds of the variables, shape (n_variables,) each; known zeros are fixed at 0."""
+    def variable_bounds(self, prescribed: Mapping[int, float] | None = None) -> tuple[Array, Array]:
+        """Scaled bounds of the variables, shape (n_variables,) each; known zeros are fixed at 0.
+
+        Args:
+            prescribed: Indices of fixed free parameters, mapped to their values, [SI].
+        """
         problem = self.problem
         k = problem.n_states * self._n_passive + int(problem.model.alignment.aligned.sum())
         limits = np.full(self._n_zeros + k, np.inf)
         limits[: self._n_zeros][problem.observations.zero_known] = 0.0
-        lower, upper = scaled_bounds(problem, prescribed)
+        lower, upper = scaled_bounds(problem, prescribed or {})
         return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
 
 

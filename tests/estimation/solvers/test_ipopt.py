@@ -241,6 +241,26 @@ def test_expressions_are_the_observation_model(root):
         assert np.abs(value(e.closures[name])).max() < 1e-12
 
 
+def test_expressions_and_bounds_are_the_program(root):
+    """A session with zeros that are known: they stay 0, and the optimum is that of `solve`."""
+    session = load_session(root / "examples/linear_delta")
+    problem, sigma = build_problem(session, model="offsets"), 5e-6
+    assert problem.observations.zero_known.any()
+    program = NonlinearProgram(problem)
+    e = program.expressions()
+    functions = {"x": e.variables, "p": e.parameters, "f": e.objective, "g": e.constraints}
+    quiet = {"ipopt": {"print_level": 0, "sb": "yes"}, "print_time": False}
+    lower, upper = program.variable_bounds()
+    x, p = program.initial_variables(sigma=sigma), program.parameter_values(sigma=sigma)
+    solver = ca.nlpsol("own", "ipopt", functions, quiet)
+    found = solver(x0=x, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)["x"]
+    zeros = ca.Function("zeros", [e.variables], [e.zeros])(found)
+    assert np.abs(zeros.full()[problem.observations.zero_known]).max() < 1e-12
+    theta = found.full()[: problem.n_free, 0]
+    optimum = program.solve(sigma=sigma).theta / problem.theta_scale
+    assert np.abs(theta - optimum).max() < 1e-4
+
+
 @pytest.mark.parametrize(
     ("options", "named"),
     [({"nonsense": 1}, "nonsense"), ({"tol": "abc"}, "tol"), ({"max_iter": -3}, "max_iter")],
