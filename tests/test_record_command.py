@@ -607,6 +607,23 @@ def test_planned_approach_and_temperature_are_recorded(folder, run):
     assert [r.conditions.temperature for r in session.readings][:3] == [21.5, 21.5, 22.5]
 
 
+def test_a_setup_that_continues_keeps_its_temperature(folder, run):
+    with_effects(folder, "thermal")
+    run(folder, "19", "0.01")
+    _, out, _ = run(folder, "", "0.02")
+    assert "Enter keeps 19 °C" in out
+    assert [r["temperature_C"] for r in rows_of(folder)][:2] == ["19", "19"]
+
+
+def test_unusual_temperatures_are_doubted_and_recorded(folder, run):
+    """Such as a reading that is typed where the temperature is asked for."""
+    with_effects(folder, "thermal")
+    _, out, _ = run(folder, "-0.19", "t 20", "0.01", "t 31", "t 35")
+    doubted = re.findall(r"Is (\S+) °C the temperature of the machine", " ".join(out.split()))
+    assert doubted == ["-0.19", "31"]
+    assert rows_of(folder)[0]["temperature_C"] == "20"
+
+
 def test_recording_continues_without_a_temperature(folder, run):
     with_effects(folder, "thermal")
     code, out, _ = run(

@@ -340,7 +340,9 @@ def _describe_order(session: Session) -> list[Finding]:
     last = model.labels[model.order[-1]]
     if last == model.labels[-1]:
         return []
-    return [describe_wrong_order(model.labels[-1], last, timed=bool(model.times))]
+    times = model.times
+    later = bool(times) and times[last] > times[model.labels[-1]]
+    return [describe_wrong_order(model.labels[-1], last, timed=later)]
 
 
 def _describe_detectable(session: Session) -> Finding:

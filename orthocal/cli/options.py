@@ -58,6 +58,8 @@ class PanelGroup(TyperGroup):
             errors = e.__cause__.errors() if isinstance(e.__cause__, ValidationError) else []
             for error in errors[:1]:
                 expected = _EXPECTED.get(error["type"], error["msg"]).format(**error.get("ctx", {}))
+                choices = expected.partition(" is not one of ")[2]
+                expected = f"one of {choices}" if choices else expected
                 e.message = f"found '{shorten(str(error['input']))}'; expected {expected}"
             raise
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
+from typing import TypeGuard
 
 import numpy as np
 
@@ -26,6 +27,12 @@ from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
 from orthocal.runtime.interrupts import raised_interrupt
 from orthocal.session.session import Conditions, Reading, ReadingKey
 from orthocal.text import printable, shorten
+
+USUAL_C = 5.0, 45.0
+"""Usual temperatures of a machine in a workshop, [°C]."""
+
+USUAL_CHANGE = 10.0
+"""Largest usual change of the temperature between two setups, [K]."""
 
 LONGEST_LINE = 10_000
 """Largest number of characters of a line that are read at once; a reading has ten."""
@@ -49,6 +56,8 @@ class RecordedConditions:
 
     def __init__(self, recording: Recording, programmed: str) -> None:
         self.temperature: float | None = None
+        self.is_unusual = False
+        """Whether the temperature that was typed last may be a mistake."""
         self.approach: str | None = None
         self.clock = sys.stdin is not None and sys.stdin.isatty()
         self.programmed = programmed
@@ -64,8 +73,16 @@ class RecordedConditions:
         if "approach" in self._needed and row.approach is None and self.approach is None:
             return "approach"
         if "temperature" in self._needed and row.setup not in self._asked:
+            self._continue(row.setup)
             return "temperature"
         return None
+
+    def _continue(self, setup: str) -> None:
+        """Propose the last temperature of a setup that was read in part."""
+        stated = [r.conditions for r in self._recording.rows if r.setup == setup and r.is_read]
+        temperatures = [c.temperature for c in stated if c and c.temperature is not None]
+        if self.temperature is None and temperatures:
+            self.temperature = temperatures[-1]
 
     def answer(self, question: str, text: str, row: Reading) -> None:
         """Store the answer to a question; an empty one accepts the proposed value.
@@ -87,7 +104,9 @@ class RecordedConditions:
             SessionError: If the temperature is not that of a workshop.
         """
         number = plain_minus(text).replace(",", ".")
-        self.temperature = parse_temperature(number, "the temperature")
+        before, self.temperature = self.temperature, parse_temperature(number, "the temperature")
+        change = abs(self.temperature - before) if _is_usual(before) else 0.0
+        self.is_unusual = not _is_usual(self.temperature) or change > USUAL_CHANGE
 
     def set_approach(self, text: str) -> None:
         """Set the approach of the following readings: one letter for each drive, or for all.
@@ -124,6 +143,11 @@ class RecordedConditions:
         now = datetime.now().astimezone().replace(microsecond=0)
         zoned = all(t is None or t.tzinfo is not None for t in times)
         return now if zoned else now.replace(tzinfo=None)
+
+
+def _is_usual(temperature: float | None) -> TypeGuard[float]:
+    """True for a usual temperature of a machine in a workshop, [°C]."""
+    return temperature is not None and USUAL_C[0] <= temperature <= USUAL_C[1]
 
 
 class Dialogue:
@@ -271,6 +295,7 @@ class Dialogue:
         row = self._recording.rows[self._require_row()]
         self._conditions.answer(question, word, row)
         self._note(self._text.conditions(self._conditions.of(row)))
+        self._doubt_temperature()
         if self._question is not None:
             self._note(self._text.question(self._question, self._conditions.temperature))
 
@@ -288,6 +313,13 @@ class Dialogue:
                 self._note(self._text.planned_side(row.approach))
                 return
             self._note(self._text.conditions(self._conditions.of(row)))
+            self._doubt_temperature()
+
+    def _doubt_temperature(self) -> None:
+        """Ask whether an unusual temperature is right."""
+        if self._conditions.is_unusual and self._conditions.temperature is not None:
+            self._note(self._text.unusual_temperature(self._conditions.temperature))
+            self._conditions.is_unusual = False
 
     def _keep(self) -> None:
         """Keep the reading of the row that is asked for; end the dialogue if no row is."""

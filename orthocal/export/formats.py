@@ -162,10 +162,12 @@ def warn_against_verdict(calibration: Calibration) -> str:
 
 
 def _add_warning(files: dict[str, str], warning: str) -> dict[str, str]:
-    """Files with a warning, if it is not empty, at the beginning of errors.yaml or README.md."""
+    """Files with a warning, if it is not empty, at the beginning of each one that has comments."""
     if not warning:
         return files
+    commented = {n: f"# {warning}\n{t}" for n, t in files.items() if n.endswith((".yaml", ".ini"))}
+    files = {**files, **commented}
     if "errors.yaml" in files:
-        return {**files, "errors.yaml": f"# {warning}\n{files['errors.yaml']}"}
+        return files
     page = files.get("README.md", "")
     return {**files, "README.md": f"**{warning}**\n" + (f"\n{page}" if page else "")}

@@ -194,14 +194,13 @@ class LinearModel:
     def order(self) -> Indices:
         """Sessions in the order of measuring, shape (n_sessions,).
 
-        The times of the readings determine the order if all readings state them. Otherwise sessions
-        whose controller corrects nothing come first; all others have the order in which they were
-        joined.
+        The times of the readings determine the order if all readings state them. Without times, or
+        at equal times, sessions whose controller corrects nothing come first; all others have the
+        order in which they were joined.
         """
-        corrections = np.hstack([self.active, self.compensated])
-        keys: list[datetime | bool] = [bool(c.any()) for c in corrections]
-        if times := self.times:
-            keys = [times[label] for label in self.labels]
+        corrected = np.abs(np.hstack([self.active, self.compensated])).max(axis=1) > 0.0
+        times = self.times or dict.fromkeys(self.labels, datetime.min.replace(tzinfo=UTC))
+        keys = [(times[n], c) for n, c in zip(self.labels, corrected.tolist(), strict=True)]
         return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
 
     @property

@@ -102,6 +102,10 @@ class RecordingText:
             noted.append(f"{conditions.temperature:g} °C")
         return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
 
+    def unusual_temperature(self, temperature: float) -> str:
+        """Question whether a temperature, [°C], is right."""
+        return f"Is {temperature:g} °C the temperature of the machine? Otherwise type it: `t 20`."
+
     def planned_side(self, approach: str) -> str:
         """The plan states the side of a reading, so that it cannot be set."""
         return (
