@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Mask
-from orthocal.errors import ClosureError, ParameterError, RobotError
+from orthocal.errors import ClosureError, ParameterError
 from orthocal.estimation.mirrored_starts import (
     MirroredDirections,
     find_mirrored_directions,
@@ -29,22 +29,18 @@ from orthocal.estimation.selection import KnownWithStd, Selection, select_parame
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.fields import read_only
 from orthocal.kinematics.continuation import Failures
-from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
 from orthocal.observation.model import ObservationModel, ReadingLinearisation
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.twist_derivatives import FreeParameters
-from orthocal.robot.model import Robot, closure_row_units, coordinate_units
-from orthocal.robot.parameters import AXES
+from orthocal.robot.model import coordinate_units
+from orthocal.robot.redundant import require_independent_rows
 from orthocal.session.session import Session
 
 LENGTH_SCALE = 1e-3
 """Scale of closures, passive motions and gauge zeros, [m]."""
-
-ROW_RANK_TOLERANCE = 1e-8
-"""Singular value below which closure rows are linearly dependent, [m per m or rad]."""
 
 
 class CalibrationProblem:
@@ -97,7 +93,7 @@ class CalibrationProblem:
         self.free = selection.names
         self.parameters = selection.parameters
         self.fixed = dict(selection.fixed)
-        _require_independent_rows(self.robot)
+        require_independent_rows(self.robot)
         self.observations: Observations = build_observations(session)
         self.noise_ratio = np.ones(self.observations.size) if noise_ratio is None else noise_ratio
         self.states = self.observations.states
@@ -479,32 +475,3 @@ def build_problem(
         tolerance_scale=tolerance_scale,
     )
     return CalibrationProblem(session, selection)
-
-
-@cached_per_robot(maxsize=8)
-def _require_independent_rows(robot: Robot) -> None:
-    """Refuse closures with linearly dependent rows.
-
-    They are redundant for the nominal machine and contradict each other for a machine with errors.
-
-    Raises:
-        RobotError: If rows are dependent; names the closures and the rows.
-    """
-    passive = robot.reference_passive
-    _, jacobian = robot.evaluate_constraints(robot.drive_zero, passive)
-    by_passive = (jacobian * closure_row_units(robot)[:, None])[:, robot.passive_index]
-    rows = [(c.name, AXES[row]) for c in robot.closures for row in c.rows]
-    independent = np.zeros((0, by_passive.shape[1]))
-    dependent = []
-    for (closure, axis), row in zip(rows, by_passive, strict=True):
-        trial = np.vstack([independent, row])
-        if np.linalg.matrix_rank(trial, tol=ROW_RANK_TOLERANCE) == len(trial):
-            independent = trial
-        else:
-            dependent.append(f"{axis} of {closure}")
-    if dependent:
-        raise RobotError(
-            f"closure rows depend on others: {', '.join(dependent)}; remove them from "
-            "orthocal.closures.<name>.rows",
-            where=str(robot.yaml),
-        )

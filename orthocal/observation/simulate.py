@@ -27,6 +27,7 @@ from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import Parameter, ParameterSet, errors_at
+from orthocal.robot.redundant import require_independent_rows
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
 
@@ -115,6 +116,7 @@ def simulate_session(
     require_seed(seed)
     if sigma is not None and not 0.0 <= sigma < math.inf:
         raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
+    require_independent_rows(plan.robot)
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
     nuisance = nuisance_parameters(plan).parameters

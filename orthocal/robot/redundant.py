@@ -1,4 +1,4 @@
-"""Redundant errors, which neither the tool nor a gauge can observe in any posture.
+"""Redundant errors, which neither the tool nor a gauge can observe, and dependent closure rows.
 
 An error of a placement moves everything that the placement carries. Passive joints follow until the
 loops are closed again. An error that they compensate completely is redundant, such as a rotation
@@ -8,16 +8,17 @@ about the axis of a hinge.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.frames import Placement, carriers
-from orthocal.robot.model import Robot
-from orthocal.robot.parameters import ElementaryError
+from orthocal.robot.model import Robot, closure_row_units
+from orthocal.robot.parameters import AXES, ElementaryError
 
 N_POSTURES = 4
 """Number of random postures in which effects are evaluated."""
@@ -30,6 +31,9 @@ UNLIMITED_TRAVEL = 0.2
 
 SMALLEST_EFFECT = 1e-9
 """Effect below which an error is redundant, relative to the largest effect of its kind."""
+
+ROW_RANK_TOLERANCE = 1e-8
+"""Singular value below which closure rows are linearly dependent, [m per m or rad]."""
 
 
 def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
@@ -153,3 +157,40 @@ def _sensitivity(
     g, p, n = np.vstack(rows), np.vstack(points), 6 * len(owners)
     passive_motion = np.linalg.lstsq(g[:, n:], -g[:, :n], rcond=RANK_TOLERANCE)[0]
     return np.asarray(p[:, :n] + p[:, n:] @ passive_motion)
+
+
+@lru_cache(maxsize=8)
+def require_independent_rows(robot: Robot) -> None:
+    """Refuse closures with too few or linearly dependent rows.
+
+    Dependent rows are redundant for the nominal machine and contradict each other for a machine
+    with errors.
+
+    Raises:
+        RobotError: Naming the closures and the rows.
+    """
+    where, passive = str(robot.yaml), robot.reference_passive
+    rows = [(c.name, AXES[row]) for c in robot.closures for row in c.rows]
+    if len(rows) < passive.size:
+        raise RobotError(
+            f"the closures constrain {len(rows)} coordinates of {passive.size} passive joints, so "
+            f"that the drives leave {passive.size - len(rows)} motions free; complete closed_loop "
+            "or orthocal.closures.<name>.rows",
+            where=where,
+        )
+    _, jacobian = robot.evaluate_constraints(robot.drive_zero, passive)
+    by_passive = (jacobian * closure_row_units(robot)[:, None])[:, robot.passive_index]
+    independent = np.zeros((0, by_passive.shape[1]))
+    dependent = []
+    for (closure, axis), row in zip(rows, by_passive, strict=True):
+        trial = np.vstack([independent, row])
+        if np.linalg.matrix_rank(trial, tol=ROW_RANK_TOLERANCE) == len(trial):
+            independent = trial
+        else:
+            dependent.append(f"{axis} of {closure}")
+    if dependent:
+        raise RobotError(
+            f"closure rows depend on others: {', '.join(dependent)}; remove them from "
+            "orthocal.closures.<name>.rows",
+            where=where,
+        )

@@ -95,18 +95,25 @@ def test_an_unknown_model_is_named_with_the_models(plan):
         build_problem(plan, model="all")
 
 
-def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("{}", r"closure rows depend on others: z of apex; remove them"),
+        ("{rows: [x]}", r"the closures constrain 1 coordinates of 2 passive joints"),
+    ],
+)
+def test_closure_rows_that_are_too_few_or_too_many_are_named(root, tmp_path, rows, message):
     folder = tmp_path / "biglide"
     folder.mkdir()
     for name in ("biglide.urdf", "biglide.yaml"):
         text = (root / "tests/robots/biglide" / name).read_text()
-        (folder / name).write_text(text.replace("{rows: [x, y]}", "{}"))
+        (folder / name).write_text(text.replace("{rows: [x, y]}", rows))
     (tmp_path / "plan.yaml").write_text(
         "robot: ./biglide\npostures: {zero: {tcp_mm: [0, 0]}}\n"
         "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
     )
-    with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; remove them"):
-        build_problem(load_plan(tmp_path / "plan.yaml"), model="offsets")
+    with pytest.raises(RobotError, match=message):
+        load_plan(tmp_path / "plan.yaml")
 
 
 def test_other_noise_ratios_are_in_the_linearisation(plan):

@@ -13,6 +13,7 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.session_controller import KINDS, require_count
 from orthocal.measurement.files.session_keys import PostureKeys, SessionKeys
 from orthocal.robot.model import Drive, Robot
+from orthocal.robot.redundant import require_independent_rows
 from orthocal.session.session import Posture, PostureForm
 from orthocal.units import DRIVE_UNITS, MM
 
@@ -57,7 +58,9 @@ def build_postures(
 
     Raises:
         SessionError: If a posture has the wrong coordinates, or the machine cannot reach it.
+        RobotError: If the closures of the robot leave motions free, or depend on each other.
     """
+    require_independent_rows(robot)
     closure = nominal_closure(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
     offset_keys = [] if keys.controller is None else keys.controller.offset_keys
