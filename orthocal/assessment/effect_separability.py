@@ -63,7 +63,12 @@ def _unshown_backlash(session: Session) -> Iterator[Finding]:
     missing = readings_without(session, "approach")
     if missing:
         lines = sorted({r.line for r in missing if r.line is not None})
-        yield words.approach_incomplete(lines, len(missing), len(session.readings))
+        yield words.approach_incomplete(
+            lines,
+            len(missing),
+            len(session.readings),
+            two_postures=any(r.minus for r in missing),
+        )
     names = list(session.postures)
     rows_read = sorted({names.index(r.posture) for r in session.readings})
     distance = np.abs(drive_table(session)[rows_read] - session.robot.drive_zero)

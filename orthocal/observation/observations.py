@@ -450,7 +450,7 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
 def _missing_condition(session: Session, condition: Condition, missing: Sequence[Reading]) -> str:
     """Readings without a condition, with their lines, and what to fill in."""
     if missing[0].minus:
-        return "is a difference"
+        return "belongs to two postures, so that it states no condition"
     first = missing[0].file or session.readings_path
     lines = [r.line for r in missing if (r.file or session.readings_path) == first]
     numbers = sorted({line for line in lines if line is not None})

@@ -33,20 +33,29 @@ def approach_not_stated() -> Finding:
     )
 
 
-def approach_incomplete(lines: Sequence[int], count: int, total: int) -> Finding:
+def approach_incomplete(
+    lines: Sequence[int], count: int, total: int, *, two_postures: bool
+) -> Finding:
     """Finding about some readings without stated side of approach.
 
     Args:
         lines: Their lines, ascending; empty if unknown.
         count: Number of these readings.
         total: Number of all readings.
+        two_postures: Whether one of them belongs to two postures, so that it cannot state a side.
     """
     where = f" ({spans(lines, 'line')})" if lines else ""
+    action = "Complete the column `approach`."
+    if two_postures:
+        action = (
+            "Differences and distances of two postures cannot state it: calibrate without them, or "
+            "without backlash (`--effects none`)."
+        )
     return note(
         "effect not shown",
         f"{count} of {total} readings{where} do not state from which side their posture was "
         "approached. `calibrate` needs it for the backlash of the drives.",
-        "Complete the column `approach`.",
+        action,
         missing=float(count),
     )
 
