@@ -35,6 +35,7 @@ AnomalyKind = Literal[
     "offset of one drive",
     "backlash not entered",
     "backlash halved",
+    "backlash entered twice",
     "machine changed",
     "lost steps",
 ]
@@ -56,6 +57,7 @@ WRONGLY_ENTERED: tuple[AnomalyKind, ...] = (
     "offsets interchanged",
     "backlash not entered",
     "backlash halved",
+    "backlash entered twice",
 )
 """Kinds that state which numbers the controller has instead of the stated ones."""
 

@@ -206,6 +206,7 @@ def compensate(plan, backlash, parts, *, seed=1):
         ((0.0, 0.0, 0.0), "backlash not entered", "xyz"),
         ((1.0, 0.0, 1.0), "backlash not entered", "y"),
         ((0.5, 0.5, 0.5), "backlash halved", "xyz"),
+        ((2.0, 2.0, 2.0), "backlash entered twice", "xyz"),
     ],
 )
 def test_backlash_that_the_controller_does_not_compensate_as_stated_is_named(
@@ -245,7 +246,7 @@ def test_a_single_session_shows_a_large_backlash_that_was_not_entered(sided, by_
 
 
 def test_each_wrong_backlash_is_considered_once():
-    """A part of the drives, all of them, none entered or the previous ones, or half."""
+    """A part of the drives, all of them, none entered or the previous ones, half or twice."""
     found = list(enter_backlash_wrongly(np.array([0.0, 2e-5]), np.array([4e-5, 6e-5])))
     assert [(k, d, np.round(a, 9).tolist()) for k, d, a in found] == [
         ("backlash not entered", (0, 1), [0.0, 2e-5]),
@@ -256,6 +257,9 @@ def test_each_wrong_backlash_is_considered_once():
         ("backlash halved", (0, 1), [2e-5, 3e-5]),
         ("backlash halved", (0,), [2e-5, 6e-5]),
         ("backlash halved", (1,), [4e-5, 3e-5]),
+        ("backlash entered twice", (0, 1), [8e-5, 12e-5]),
+        ("backlash entered twice", (0,), [8e-5, 6e-5]),
+        ("backlash entered twice", (1,), [4e-5, 12e-5]),
     ]
 
 

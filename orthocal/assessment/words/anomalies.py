@@ -417,6 +417,7 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets interchanged": lambda: _entered(e, "interchanged"),
         "backlash not entered": lambda: _compensated(session, e),
         "backlash halved": lambda: _compensated(session, e),
+        "backlash entered twice": lambda: _compensated(session, e),
     }
     return texts[e.kind]()
 
@@ -621,15 +622,17 @@ def _compensated(session: Session, e: Explanation) -> str:
     A single session does not distinguish it from a larger backlash.
     """
     drives = zip(session.robot.drives, e.active, strict=True)
-    part, size = "does not compensate the stated", "twice"
+    part, size = "does not compensate the stated", "twice the stated one"
     if e.kind == "backlash halved":
-        part, size = "compensates only half of the stated", "1.5 times"
+        part, size = "compensates only half of the stated", "1.5 times the stated one"
+    elif e.kind == "backlash entered twice":
+        part, size = "compensates twice the stated", "almost 0"
     elif any(active for drive, active in drives if drive.name in e.drives):
         part = "still compensates the previous"
     text = f"the controller {part} backlash of {joined(e.drives)}"
     if e.sessions:
         return f"in session {e.sessions[0]} {text}"
-    return f"{text}, or the backlash is {size} the stated one"
+    return f"{text}, or the backlash is {size}"
 
 
 def _remedy(session: Session, e: Explanation) -> str:
@@ -774,7 +777,8 @@ def _session_remedy(session: Session, e: Explanation) -> str:
         number = "backlash" if e.kind.startswith("backlash") else "offsets"
         key = f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
         which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
-        complete = " LinuxCNC's BACKLASH is the complete backlash." * (e.kind == "backlash halved")
+        by_factor = e.kind in ("backlash halved", "backlash entered twice")
+        complete = " LinuxCNC's BACKLASH is the complete backlash." * by_factor
         return (
             f"Compare the {number} in the controller with `{key}` of {which}.{complete} If the "
             "session states wrong numbers, correct them there; otherwise enter the right ones and "

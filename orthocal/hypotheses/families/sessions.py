@@ -119,6 +119,7 @@ def enter_backlash_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
             ("backlash not entered", before),
             ("backlash not entered", np.zeros_like(stated)),
             ("backlash halved", 0.5 * stated),
+            ("backlash entered twice", 2.0 * stated),
         ],
     )
 
