@@ -21,6 +21,7 @@ from orthocal.measurement.joining import split_sessions
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
+from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import INCH, MM
 
@@ -42,6 +43,9 @@ WRONG_UNIT_RATIO = 30.0
 
 MIN_RANGE_STEPS = 10
 """Steps in the range of a gauge below which its resolution is in a wrong unit."""
+
+MIN_EXCESS = 1.5
+"""Ratio of noise with and without an unstated rounding above which the rounding matters."""
 
 MIN_SPANNED_STEPS = 3
 """Steps between the extreme readings below which the resolution contradicts them."""
@@ -90,7 +94,8 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
 
     A noise of many times the resolution is in a wrong unit, and so is a resolution if the range has
     only a few steps. If readings are between steps, the resolution is wrong if it is many times the
-    noise, or if the readings span only a few steps.
+    noise, or if the readings span only a few steps. If all readings are multiples of ten steps, it
+    is wrong if such a rounding is larger than the stated noise.
     """
     for name, gauge in session.gauges.items():
         step, sigma = gauge.resolution, gauge.sigma
@@ -102,6 +107,9 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
             yield words.coarser_than_range(step, gauge.range)
             continue
         rows = _rows_of(session, name)
+        coarser = _coarser_step(session.values[rows], step)
+        if noise_floor(sigma, coarser) > MIN_EXCESS * noise_floor(sigma, step):
+            yield words.finer_than_readings(len(rows), step, coarser)
         finer = _finer_rows(session, rows, gauge)
         if finer and (
             step > WRONG_UNIT_RATIO * sigma
@@ -109,6 +117,20 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
             else np.ptp(session.values[rows]) < MIN_SPANNED_STEPS * step
         ):
             yield words.coarser_than_readings(len(finer), len(rows), step, *_first(session, finer))
+
+
+def _coarser_step(values: Array, step: float) -> float:
+    """Largest step, ten times the stated one or more, of which all readings are multiples, [m].
+
+    The stated step if a reading is no multiple, or if all are multiples by chance.
+    """
+    nonzero = np.abs(values[values != 0.0]) / step
+    while 10.0 ** -len(nonzero) < MISTAKE_PROBABILITY:
+        coarser = nonzero / 10.0
+        if (np.abs(coarser - np.round(coarser)) > STEP_TOLERANCE).any():
+            break
+        nonzero, step = coarser, 10.0 * step
+    return step
 
 
 def find_finer(session: Session) -> Iterator[Finding]:

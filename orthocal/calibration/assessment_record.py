@@ -61,6 +61,7 @@ FindingKind = Literal[
     "residuals too small",
     "sigma too large",
     "resolution too coarse",
+    "resolution too fine",
     "postures too near",
     "legs differ",
     # a fit

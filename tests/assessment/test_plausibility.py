@@ -164,6 +164,16 @@ def test_an_impossible_resolution_is_the_only_finding(cycles, gauge, number):
     assert all(p.line for p in found.places)
 
 
+def test_a_resolution_of_a_tenth_of_the_readings_is_the_only_finding(cycles):
+    """Rounding to 0.01 mm would look like mistakes."""
+    wrong = cycles.with_gauge(replace(cycles.gauge, resolution=1e-6, sigma=0.5e-6))
+    (found,) = [f for f in judge_session(wrong).findings if f.severity != "note"]
+    assert found.kind == "resolution too fine"
+    assert found.numbers == pytest.approx({"resolution_mm": 0.001, "coarser_mm": 0.01})
+    rows = np.arange(5)  # five such readings may be by chance
+    assert not list(find_impossible_gauges(wrong.select([wrong.readings[i] for i in rows])))
+
+
 @pytest.mark.parametrize("resolution", [1e-6, 5e-6, 10e-6, None])
 def test_a_possible_resolution_has_no_finding(cycles, resolution):
     for limits in (cycles.gauge.range, None):

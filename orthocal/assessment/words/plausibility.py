@@ -181,6 +181,20 @@ def coarser_than_readings(
     )
 
 
+def finer_than_readings(total: int, step: float, coarser: float) -> Finding:
+    """Finding that all readings are multiples of a coarser step than the stated one, [m]."""
+    return review(
+        "resolution too fine",
+        f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm), but all "
+        f"{total} readings are multiples of {coarser / MM:g} mm. Such readings scatter more than "
+        "the stated noise.",
+        f"State `resolution_mm: {coarser / MM:g}`, and the noise of this gauge in sigma_mm; or "
+        "write all digits that the gauge shows.",
+        resolution_mm=step / MM,
+        coarser_mm=coarser / MM,
+    )
+
+
 def residuals_too_small(residual: float, rounding: float, step: float) -> Finding:
     """Finding about residuals that are smaller than the rounding to steps of the gauge, [m]."""
     return review(
