@@ -287,6 +287,26 @@ def test_enlargement_and_residuals_on_the_pages_are_correct(root):
     assert noise.residual_sigma / gauge == pytest.approx(10.0, abs=0.5)
 
 
+def test_the_five_bar_of_a_page_is_the_example(root):
+    """Its tool is where circles about the ends of both arms intersect."""
+    _, _, text = (root / "examples/fivebar/fivebar.yaml").read_text().partition("\n")
+    assert text in blocks("yaml", "docs/robots.md")
+    robot = orthocal.load_robot(root / "examples/fivebar")
+    assert {"frame.tip1.x", "frame.tip2.x"} <= set(robot.parameters.complete)
+    zero = np.sqrt(0.2**2 - (0.06 + 0.15 * np.cos(np.radians(50))) ** 2)
+    base = -0.15 * np.sin(np.radians(50)) - zero
+    for angles in ([130.0, 50.0], [117.0, 62.0], [150.0, 55.0]):
+        ends = [
+            np.array([side * 0.06 + 0.15 * np.cos(a), base + 0.15 * np.sin(a)])
+            for side, a in zip((-1, 1), np.radians(angles), strict=True)
+        ]
+        half = 0.5 * (ends[1] - ends[0])
+        across = np.array([-half[1], half[0]]) / np.linalg.norm(half)
+        tool = ends[0] + half + across * np.sqrt(0.2**2 - half @ half)
+        found = orthocal.Machine(robot, {}).forward(np.radians(angles))
+        assert np.abs(found[:2] - tool).max() < 1e-6  # the URDF states the base to 1 µm
+
+
 def test_session_on_a_page_can_be_read(tmp_path):
     (session,) = blocks("yaml", "docs/sessions.md")
     readings = next(b for b in blocks("text", "docs/sessions.md") if "reading_mm" in b)

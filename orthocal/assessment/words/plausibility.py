@@ -73,12 +73,20 @@ def outstanding_error(parameter: Parameter, error: float) -> Finding:
     """Finding about one error far beyond its tolerance, [SI], that explains the readings."""
     error, tolerance = (v * parameter.edge_factor for v in (error, show_limit(parameter.prior_std)))
     unit = parameter.edge_unit
+    action = (
+        "Measure that place or part again. If it is so far off, state its true value or a larger "
+    )
+    kind, *names = parameter.name.split(".")
+    if kind == "setup" and names:
+        action = (
+            f"Read setup {names[0]} again: a wrong reading, such as a dial misread by one turn, "
+            "may look the same. If the readings were right, state the true value or a larger "
+        )
     return reject(
         "beyond tolerances",
         f"One error explains these readings almost alone: {parameter.name} of about {error:+.3g} "
         f"{unit}, where at most ±{tolerance:g} {unit} are stated.",
-        "Measure that place or part again. If it is so far off, state its true value or a larger "
-        "tolerance.",
+        f"{action}tolerance.",
         parameter_places(parameter.name),
         **{f"error_{unit}": error, f"tolerance_{unit}": tolerance},
     )
