@@ -13,7 +13,9 @@ import pytest
 from orthocal import (
     CalibrationProblem,
     Choice,
+    Effect,
     ElementaryError,
+    Frames,
     Gauge,
     LiveScene,
     Machine,
@@ -293,6 +295,18 @@ def test_points_far_beyond_all_numbers(calibration):
         calibration.machine.inverse([1e308, 0.0, 0.0])
 
 
+class Misspelt(Effect):
+    name = "misspelt"
+    conditions = ("temprature",)
+
+
+def test_positions_in_a_plane_have_drive_coordinates(biglide):
+    machine = Machine(biglide, {})
+    drives = biglide.drive_zero + np.array([0.01, -0.02])
+    assert machine.inverse(machine.forward(drives)) == pytest.approx(drives, abs=1e-12)
+    assert machine.inverse([machine.forward(drives)])[0] == pytest.approx(drives, abs=1e-12)
+
+
 def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, tmp_path):
     for act, message in (
         (lambda: calibrate(5), "expected a Session, the path to one, or a list of them"),
@@ -331,6 +345,8 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
         (lambda: experiment_2.robot.with_errors(5), "errors: found a int; expected a mapping"),
         (lambda: calibration.machine.inverse(np.zeros(3), conditions="ppp"), "UseConditions"),
         (lambda: restore_session(experiment_2), "expected a Calibration"),
+        (lambda: Frames("tcp"), "Frames.in_posture: found 'tcp'"),
+        (lambda: register_effect(Misspelt), "Misspelt.conditions: found 'temprature'"),
         (lambda: write_session(calibration, tmp_path / "s"), "expected a Session"),
         (lambda: register_sensor("wire"), "expected a class"),
         (lambda: register_sensor(Gauge), "is not a sensor"),
@@ -350,5 +366,8 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
             act()
     with pytest.raises(OrthocalError, match="expected 3 letters"):
         calibration.machine.inverse(np.zeros(3), conditions=UseConditions(5))
+    problem = build_problem(experiment_2, model="offsets")
+    with pytest.raises(ValueError, match="expected 22 free parameters, or the 3 of"):
+        problem.predict(np.zeros(4))
     with pytest.raises(OrthocalError, match="file names cannot have"):
         write_calibration(calibration, tmp_path / "a\0b")

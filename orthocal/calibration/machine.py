@@ -68,7 +68,7 @@ class Machine:
 
         Args:
             points: Commanded coordinates of the tool, shape (K, n_coordinates) or
-                (n_coordinates,), [m].
+                (n_coordinates,), [m]; or positions, shape (K, 3) or (3,).
             names: Names of the rows, for messages.
             conditions: Conditions of use, as for `forward`.
 

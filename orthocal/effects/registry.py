@@ -10,9 +10,10 @@ effect and its class:
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import get_args
 
 from orthocal.arguments import require_kind
-from orthocal.effects.protocol import Effect
+from orthocal.effects.protocol import Condition, Effect
 from orthocal.errors import OrthocalError
 from orthocal.runtime.registry import Registry
 
@@ -24,6 +25,9 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     """Require that an offered class is an effect of the name of its entry point."""
     if not issubclass(offered, Effect) or offered.name != name:
         raise TypeError(f"{offered.__qualname__} is not an Effect with name = '{name}'")
+    if unknown := [c for c in offered.conditions if c not in get_args(Condition)]:
+        expected = ", ".join(get_args(Condition))
+        raise TypeError(f"{offered.__qualname__}.conditions: found {unknown[0]!r}; {expected}")
     return offered
 
 

@@ -422,8 +422,18 @@ class CalibrationProblem:
         )
 
     def _of_machine(self, theta: ArrayLike) -> Array:
-        """Errors of the machine among the free parameters, shape (..., n_machine), [SI]."""
-        return np.asarray(theta, dtype=np.float64)[..., : self.n_machine]
+        """Errors of the machine among the free parameters, shape (..., n_machine), [SI].
+
+        Raises:
+            ValueError: If there are neither n_free nor n_machine values.
+        """
+        values = np.asarray(theta, dtype=np.float64)
+        if values.shape[-1:] not in ((self.n_free,), (self.n_machine,)):
+            raise ValueError(
+                f"theta: found the shape {values.shape}; expected {self.n_free} free parameters, "
+                f"or the {self.n_machine} of the machine"
+            )
+        return values[..., : self.n_machine]
 
     def _nuisance_deviations(self, theta: ArrayLike) -> Array | None:
         """Deviations of nuisance parameters among the free parameters; None without any."""

@@ -172,7 +172,9 @@ class LoopClosure:
         """Drive coordinates that bring the tool centre point to points.
 
         Args:
-            points: Commanded coordinates of the tool, shape (K, n_drives) or (n_drives,), [m].
+            points: Commanded coordinates of the tool, shape (K, n_drives) or (n_drives,), [m]; or
+                positions as `forward` returns them, shape (K, 3) or (3,), of which the others are
+                ignored.
             names: Names of the postures, for messages.
             failures: Filled with the points that cannot be reached; by default the first raises.
 
@@ -183,7 +185,10 @@ class LoopClosure:
             ClosureError: If a point cannot be reached.
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
-        p, single = as_rows(points, len(require_tcp(self.robot).coordinates), "coordinates")
+        coordinates = require_tcp(self.robot).coordinates
+        if len(coordinates) < 3 and np.shape(points)[-1:] == (3,):
+            points = np.asarray(points)[..., list(coordinates)]
+        p, single = as_rows(points, len(coordinates), "coordinates")
         drives, _ = self.reach(p, names=names, failures=failures)
         return drives[0] if single else drives
 

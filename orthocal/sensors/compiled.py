@@ -81,7 +81,9 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     """
     pattern = _Pattern(robot, sensor, sensor.frames(robot))
     reading = _compile(pattern)
-    if reading.probe is not None and _probe(pattern) != reading.probe:
+    if reading.probe is not None and not np.array_equal(
+        _probe(pattern), reading.probe, equal_nan=True
+    ):
         raise OrthocalError(
             f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
             "constants and nuisance parameters: put what differs between setups into `constants`"

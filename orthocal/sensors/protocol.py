@@ -9,12 +9,13 @@ the poses in both postures.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
 from pydantic import Field
 
+from orthocal.arguments import require_names
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Condition
 from orthocal.errors import SessionError
@@ -93,6 +94,10 @@ class Frames:
     """Frames in the reference posture."""
     in_second: tuple[str, ...] = ()
     """Frames in the second posture, for a sensor that reads pairs of postures."""
+
+    def __post_init__(self) -> None:
+        for field_ in fields(self):
+            require_names(getattr(self, field_.name), argument=f"Frames.{field_.name}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

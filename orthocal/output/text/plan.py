@@ -404,7 +404,8 @@ def _when_enough(plan: MeasuringPlan) -> str:
             f"instead of {_in_um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
             f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)}).{other}"
         )
-    if plan.stage.minutes <= enough.minutes and plan.stage.error <= enough.error:
+    as_good = plan.stage.minutes <= enough.minutes and plan.stage.error <= enough.error
+    if as_good or _in_um(enough.error) == _in_um(plan.stage.error):
         return f"Further setups gain less than {HOURLY_GAIN:.0%} an hour."
     return (
         f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
