@@ -54,6 +54,8 @@ from orthocal.measurement.importing.headings import (
         ("temperature (deg F)", ("temperature", None, None)),
         ("Machine temperature in °F", ("temperature", None, None)),
         ("temp", ("temperature", None, None)),
+        ("Temp. [°C]", ("temperature", None, None)),
+        ("Wdh.", ("cycle", None, None)),
         ("reading [°C]", None),
         ("Anfahrrichtung", ("approach", None, None)),
         ("Datum und Uhrzeit", ("time", None, None)),

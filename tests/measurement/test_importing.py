@@ -160,6 +160,8 @@ FORMS = [
     text("fill", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\nyx;zero;1,5\n", fill=True),
     text("not-filled", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\n",
          "{}:3: has a reading but no setup; --fill copies the setup from the row above"),
+    text("total", "setup;posture;Wert mm\nxy;zero;0,00\n;Summe:;-0,43\n",
+         "{}:3: has a reading but no setup; it seems to be a total of others: delete it"),
     text("groups-by-point", HEAD.replace("mm", "um") + "xy;zero;1.234,5\n",
          one("1234.5", unit="um")),
     text("groups-by-comma", HEAD.replace("mm", "um") + "xy;zero;1,234.5\n",

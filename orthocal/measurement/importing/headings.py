@@ -63,8 +63,18 @@ WORDS: dict[Role, tuple[str, ...]] = {
         *("abzüglich", "weniger", "minus stellung", "stellung minus", "minus position"),
     ),
     "cycle": (
-        *("cycle", "cycles", "repeat", "repetition", "run", "pass", "round"),
-        *("zyklus", "durchgang", "wiederholung", "lauf", "durchlauf", "messreihe", "umlauf"),
+        *("cycle", "cycles", "repeat", "repetition", "rep", "rep.", "run", "pass", "round"),
+        *(
+            "wdh",
+            "wdh.",
+            "zyklus",
+            "durchgang",
+            "wiederholung",
+            "lauf",
+            "durchlauf",
+            "messreihe",
+            "umlauf",
+        ),
     ),
     "reading": (
         *("reading", "readings", "value", "measured", "measured value", "measurement"),
@@ -76,7 +86,7 @@ WORDS: dict[Role, tuple[str, ...]] = {
         *("anfahrrichtung", "anfahrt", "anfahrseite"),
     ),
     "temperature": (
-        *("temperature", "temp", "machine temperature", "temperature of the machine"),
+        *("temperature", "temp", "temp.", "machine temperature", "temperature of the machine"),
         *("temperatur", "maschinentemperatur"),
     ),
     "time": (

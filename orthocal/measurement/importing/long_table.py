@@ -52,6 +52,9 @@ from orthocal.units import MM
 
 NO_READING = "no reading"
 
+TOTALS = ("sum", "total", "mean", "average", "summe", "mittelwert", "mittel", "durchschnitt", "σ")
+"""Words in a row that is computed from others."""
+
 REQUIRED_NAMES: tuple[Role, ...] = ("setup", "posture")
 """Columns of names that every row with a reading needs."""
 
@@ -240,6 +243,24 @@ def _find_posture(
     return postures[0]
 
 
+def _require_names(
+    table: Table, row: Row, names: Mapping[Role, str], roles: Sequence[Role]
+) -> None:
+    """Refuse a row with a reading that lacks a name.
+
+    Raises:
+        SessionError: If a name is missing.
+    """
+    for role in roles:
+        if not names[role]:
+            total = any(_name(c).rstrip(":").casefold() in TOTALS for c in row.cells)
+            advice = f"--fill copies the {role} from the row above"
+            advice = "it seems to be a total of others: delete it" if total else advice
+            raise SessionError(
+                f"has a reading but no {role}; {advice}", where=table.place(row.line)
+            )
+
+
 def _names(row: RawReading) -> tuple[str, str, str]:
     return row.setup, row.posture, row.minus
 
@@ -294,12 +315,7 @@ def _read_entries(
             continue
         if fill:
             names = above = {role: name or above[role] for role, name in names.items()}
-        for role in name_roles:
-            if not names[role]:
-                raise SessionError(
-                    f"has a reading but no {role}; --fill copies the {role} from the row above",
-                    where=table.place(row.line),
-                )
+        _require_names(table, row, names, name_roles)
         cells = _read_optional_cells(table, row, columns) | names
         for i, heading in _length_columns(columns, filled_cells).items():
             where = table.place(row.line, i)
