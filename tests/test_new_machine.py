@@ -360,6 +360,12 @@ def test_a_plan_out_of_reach_is_old(copied):
     assert code == 3
     assert "first/session.yaml: postures.x_min: " in err
     assert "first: the plan is old (the machine does not reach its postures); plan again" in err
+    csv = copied / "first/readings.csv"  # which `plan --force` would not replace
+    csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
+    code, _, err = orthocal("new", copied, "--again")
+    assert code == 3
+    assert "it has readings, so check the dimensions" in err
+    assert "--force" not in err
 
 
 def test_existing_files_are_not_overwritten(copied):

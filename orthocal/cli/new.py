@@ -524,12 +524,23 @@ def _make_again(folder: Path) -> None:
         changes = _remake_sheet(sheet, robot) if exists(sheet.parent / "session.yaml") else []
         if changes:
             is_outdated = True
-            put_note(
-                f"orthocal: {sheet.parent}: the plan is old ({'; '.join(changes)}); plan again:\n"
-                f"  orthocal plan {folder} --out {sheet.parent} --force"
-            )
+            advice = f"plan again:\n  orthocal plan {folder} --out {sheet.parent} --force"
+            if _count_readings(sheet.parent):
+                advice = (
+                    "it has readings, so check the dimensions: with longer legs, for instance, "
+                    "travel_mm is larger, too. For other dimensions, plan into another directory"
+                )
+            put_note(f"orthocal: {sheet.parent}: the plan is old ({'; '.join(changes)}); {advice}")
     if is_outdated:
         raise typer.Exit(3)
+
+
+def _count_readings(folder: Path) -> int:
+    """Number of readings in the table of a session, which may not load."""
+    from orthocal.cli.overwriting import count_numbers
+
+    table = folder / "readings.csv"
+    return count_numbers(table) if exists(table) else 0
 
 
 def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:

@@ -99,7 +99,7 @@ def _require_no_readings(directory: Path) -> None:
         path = session.readings_path
     named = path is not None and exists(table) and path.samefile(table)
     if not count and not named:  # a table that no valid session names
-        count, path = _count_numbers(table), table
+        count, path = count_numbers(table), table
     if count:
         raise SessionError(
             f"contains {counted(count, 'reading')}, which --force does not overwrite; move "
@@ -108,7 +108,7 @@ def _require_no_readings(directory: Path) -> None:
         )
 
 
-def _count_numbers(path: Path) -> int:
+def count_numbers(path: Path) -> int:
     """Number of rows with a number among the readings of a table, whatever else is wrong in it.
 
     Without a column of readings, any number except that of a cycle counts.
