@@ -187,17 +187,20 @@ def _read_joints(
     Raises:
         ParameterError: If the compensation differs, or such an option is stated.
     """
-    from orthocal.effects.compensation import compensates_alike
+    from orthocal.effects.compensation import JointTrim
+    from orthocal.export.linuxcnc.entered_lines import compare_joints
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     joints = read_controller_joints(path, calibration.robot)
     for option, value in stated.items():
         if value is not None and (option != "--latched" or joints.latched is not None):
             raise ParameterError("is stated by --ini, too; state one of them", where=option)
-    if not compensates_alike(joints.compensation, calibration.session.compensation):
+    drives, stated_trims = calibration.robot.drives, calibration.session.compensation
+    expected = stated_trims or (JointTrim(),) * len(drives)
+    if differences := compare_joints(zip(drives, expected, joints.compensation, strict=True)):
         raise ParameterError(
             "has other BACKLASH or COMP_FILE than the session states under `controller` "
-            "(backlash_mm, comp_file); expected the INI file of the measurement",
+            f"(backlash_mm, comp_file): {differences}. Expected is the INI file of the measurement",
             where=str(path),
         )
     return joints

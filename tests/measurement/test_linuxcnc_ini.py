@@ -126,6 +126,8 @@ def test_export_refuses_the_file_of_another_controller(folder, one):
     done = export(folder, one, "home", "--ini", folder / "machine.ini")
     assert done.returncode == 2
     assert "machine.ini" in done.stderr
+    message = " ".join(done.stderr.split())
+    assert "JOINT_0 has BACKLASH 0.031 mm instead of BACKLASH 0 or none" in message
     assert not (folder / "home").exists()
 
 

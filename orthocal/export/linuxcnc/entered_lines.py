@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -68,18 +68,28 @@ def describe_other_lines(
             f"{file} has HOME_OFFSET for other offsets of the slides than the new session: "
             f"{values}. Enter those of the session, or use the lines of this calibration's export."
         )
-    differences = [
-        f"JOINT_{i} has {_describe(drive, trim)} instead of {_describe(drive, joint, trim)}"
-        for i, (drive, joint, trim) in enumerate(_pair_trims(calibration, compensation))
-        if not compensates_alike([joint], [trim])
-    ]
-    if differences:
+    if differences := compare_joints(_pair_trims(calibration, compensation)):
         sentences.append(
             f"{file} differs from the lines that this calibration says to enter: "
-            f"{joined(differences)}. The new session states what the file contains: measure with "
+            f"{differences}. The new session states what the file contains: measure with "
             "these lines, or enter the others and run `orthocal again` anew."
         )
     return "\n".join(sentences)
+
+
+def compare_joints(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
+    """Differences between the expected and the present compensation of joints; "" without any.
+
+    Args:
+        joints: Drive, expected and present compensation of each joint.
+    """
+    return joined(
+        [
+            f"JOINT_{i} has {_describe(drive, trim)} instead of {_describe(drive, joint, trim)}"
+            for i, (drive, joint, trim) in enumerate(joints)
+            if not compensates_alike([joint], [trim])
+        ]
+    )
 
 
 def _pair_trims(
