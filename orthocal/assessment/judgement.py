@@ -205,15 +205,19 @@ def is_far(value: float, mean: float, std: float) -> bool:
 def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list[Finding]:
     """Findings about anomalies; if there are none, about readings that do not repeat.
 
-    If a gauge is impossible as stated, the findings are about gauges alone.
+    If a gauge is impossible as stated, the findings are about gauges alone. But readings in another
+    unit are multiples of a coarser step, too.
 
     Args:
         session: The session.
         anomalies: Its anomalies, if they were found already.
     """
-    if impossible := list(find_impossible_gauges(session)):
+    impossible = list(find_impossible_gauges(session))
+    if any(f.kind != "resolution too fine" for f in impossible):
         return impossible
     findings = describe_anomalies(session, anomalies or find_anomalies(session))
+    if impossible and not any(f.kind in ("decimal point", "wrong unit") for f in findings):
+        return impossible
     return findings or [*find_scattered(session), *find_exchanged_sides(session)]
 
 

@@ -200,7 +200,7 @@ def test_machines_of_other_dimensions_and_tolerances_share_functions(folder, ort
     [
         # a frame in which no error acts
         lambda r: r.displaced({Placement(r.frame_id("platform_mount"), True): np.full(6, 0.1)}),
-        lambda r: replace(r, closures=r.closures[1:]),
+        lambda r: replace(r, closures=r.closures[1:], constraints=r.constraints[1:]),
         lambda r: replace(r, closures=tuple(replace(c, rows=c.rows[:1]) for c in r.closures)),
         lambda r: replace(r, reference_posture=r.reference_posture + 1e-3),
         lambda r: replace(r, tcp=None),
