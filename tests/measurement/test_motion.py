@@ -524,8 +524,8 @@ def bar(directory):
 def test_linuxcnc_triggers_a_logger_in_every_posture_of_a_ball_bar(small, bar, tmp_path):
     """At each trigger the slides rest in the posture, and the bar shows its simulated reading."""
     bar = replace(bar, readings=bar.readings[3:])  # quarters of circles
-    (motion,), dwell = plan_motion(bar), 0.2
-    options = ProgramOptions(6000.0, 1500.0, dwell=dwell, trigger="0")
+    (motion,) = plan_motion(bar)
+    options = ProgramOptions(6000.0, 1500.0, dwell=0.4, trigger="0")
     program = write_program(bar, motion, options)
     recorded, (pauses,) = _run_nominal(small, program, tmp_path, output=True)
     assert len(pauses) == 2  # before the first motion, and where the bar is mounted
@@ -534,7 +534,8 @@ def test_linuxcnc_triggers_a_logger_in_every_posture_of_a_ball_bar(small, bar, t
     read = [stop for stop in motion.stops if stop.role == "reading"]
     assert slides[rising] == pytest.approx(np.array([s.drives for s in read]) / MM, abs=5e-4)
     for k in rising:
-        before = slides[max(k - int(0.9e3 * dwell), 0) : k]
+        # 180 ms of the joints: on a busy computer they run slower than the clock of the dwell
+        before = slides[max(k - 180, 0) : k]
         assert np.abs(before - slides[k]).max() < 1e-6
 
     def shown(errors, slides):
