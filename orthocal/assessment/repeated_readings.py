@@ -177,8 +177,7 @@ def find_exchanged_sides(session: Session) -> tuple[Finding, ...]:
     """
     findings = []
     for part in split_sessions(session):
-        differences = _list_differences(part)
-        exchanged = _find_exchanged([d for d in differences if d.values.size], part)
+        exchanged = _find_exchanged(_list_differences(part), part)
         if exchanged:
             rows = np.concatenate([d.rows for d in exchanged])
             findings.append(
@@ -249,12 +248,9 @@ def _list_differences(session: Session) -> list[_Differences]:
     problem = linear_model(session).problem
     linear, plus = problem.linearisation_at_active, problem.observations.plus
     columns = [problem.free.index(name) for name in names]
-    by_backlash = linear.jacobian[plus][:, columns] / problem.theta_scale[columns]
     ratio = problem.noise_ratio[plus]
-    deviations, by_backlash = (
-        session.values - ratio * linear.reading[plus],
-        by_backlash * ratio[:, None],
-    )
+    deviations = session.values - ratio * linear.reading[plus]
+    by_backlash = linear.jacobian[plus][:, columns] / problem.theta_scale[columns] * ratio[:, None]
     rows, listed = Rows(session), []
     for name, of_setup in rows.setups.items():
         single = of_setup[rows.single[of_setup] & ~rows.paired[of_setup]]

@@ -436,22 +436,25 @@ def at(session, day):
 
 
 def test_sessions_are_in_the_order_of_their_times(plan):
-    """Otherwise those without active offsets come first."""
+    """Without times, or at equal ones, those without active offsets come first."""
     sessions = [plan.with_controller(v) for v in (ENTERED, 0.0 * ENTERED, ENTERED)]
     assert LinearModel(join_sessions(sessions)).order.tolist() == [1, 0, 2]
     timed = [at(s, day) for s, day in zip(sessions, (3, 2, 1), strict=True)]
     assert LinearModel(join_sessions(timed)).order.tolist() == [2, 1, 0]
+    equal = [at(s, 1) for s in sessions]
+    assert LinearModel(join_sessions(equal)).order.tolist() == [1, 0, 2]
 
 
-@pytest.mark.parametrize("timed", [True, False])
-def test_sessions_in_another_order_are_found(plan, timed):
+@pytest.mark.parametrize("days", [(1, 2), (1, 1), ()])
+def test_sessions_in_another_order_are_found(plan, days):
     """The later one by its times, which is certain, or the one that states active offsets."""
+    timed = days == (1, 2)
     sessions = [
         simulate_session(plan.with_controller(v), {}, seed=k).session
         for k, v in enumerate((0.0 * ENTERED, 0.0 * ENTERED if timed else ENTERED))
     ]
-    if timed:
-        sessions = [at(s, day) for s, day in zip(sessions, (1, 2), strict=True)]
+    if days:
+        sessions = [at(s, day) for s, day in zip(sessions, days, strict=True)]
     for given, notes in ((sessions, []), (sessions[::-1], ["session-1"])):
         found = [f for f in judge_session(join_sessions(given)).findings if f.kind == "wrong order"]
         assert [f.severity for f in found] == ["review" if timed else "note"] * len(notes)
