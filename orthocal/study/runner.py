@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -214,11 +215,14 @@ def _run_on_dask(study: Study, tasks: Sequence[int], address: str) -> Iterator[T
     """Run tasks on the workers of a Dask scheduler."""
     try:
         from distributed import Client, as_completed
+        from distributed.comm import get_address_host_port
     except ImportError:
         raise OrthocalError(
             "needs the extra `cluster`: pip install 'orthocal[cluster]'", where="--dask"
         ) from None
     try:
+        # a client that does not connect can block the next one while it is collected as garbage
+        socket.create_connection(get_address_host_port(address, strict=True), DASK_TIMEOUT).close()
         client = Client(address, timeout=DASK_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as e:
         raise OrthocalError(
