@@ -51,7 +51,6 @@ def on_rods(plan):
     [
         ("workshop", 2e-3, 24, np.inf),
         ("workshop", 0.2e-3, 24, 19e-6),
-        ("sweep", 0.2e-3, 10, 15.7e-6),
     ],
 )
 def test_tool_errors_and_intervals_are_as_predicted(name, offset_std, count, largest):

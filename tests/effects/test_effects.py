@@ -9,7 +9,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from derivatives import assert_derivative, central_differences
+from derivatives import assert_derivative
 from effect_plans import write_plan, write_robot
 from gauges import exact
 from slack import Slack
@@ -20,20 +20,16 @@ from orthocal import (
     load_calibration,
     load_plan,
     load_robot,
-    load_session,
     restore_session,
     simulate_session,
     write_calibration,
-    write_session,
 )
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.rods import stretch_rod
 from orthocal.errors import OrthocalError, ParameterError, RobotError, SessionError
-from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.error_map import error_map
@@ -325,37 +321,6 @@ def test_the_tool_sensitivity_and_the_inverse_are_exact(plan):
     assert np.abs(closure.inverse(closure.forward(drives)) - drives).max() < CLOSED
 
 
-def test_the_program_has_exact_derivatives(problem):
-    program = NonlinearProgram(problem, options=SolverOptions(hessian="exact"))
-    f, theta = program.functions(), point(problem)
-    x, p = program.initial_variables(theta, sigma=1e-4), program.parameter_values(sigma=1e-4)
-    rng = np.random.default_rng(4)
-    along = rng.normal(size=(x.size, 6))
-    along /= np.linalg.norm(along, axis=0)
-    lam = rng.normal(size=f["nlp"].size1_out(1))
-    gradient = np.asarray(f["grad_f"](x, p)[1]).ravel()
-    jacobian = np.asarray(f["jac_g"](x, p)[1].full())
-
-    def both(t):
-        objective, closure = f["nlp"](x + along @ t, p)
-        return np.r_[float(objective), np.asarray(closure).ravel()]
-
-    numeric = central_differences(both, np.zeros(6), step=1e-4)
-    found = np.vstack([gradient @ along, jacobian @ along])
-    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
-    assert (np.abs(found - numeric) / scale).max() < DERIVATIVE
-
-    def slope(t):
-        gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
-        return gradient + np.asarray(ca.mtimes(f["jac_g"](x + along @ t, p)[1].T, lam)).ravel()
-
-    upper = np.asarray(f["hess_lag"](x, p, 1.0, lam).full())
-    hessian = upper + np.triu(upper, 1).T
-    numeric = central_differences(slope, np.zeros(6), step=1e-4)
-    size = max(1.0, np.abs(numeric).max())
-    assert np.abs(hessian @ along - numeric).max() / size < DERIVATIVE
-
-
 # ---- identification
 
 
@@ -385,16 +350,6 @@ def test_both_solvers_identify_the_same_errors(simulated):
     assert np.abs(off).max() < 4.0
     determined = [problem.free.index(n) for n in TRUTH if n.endswith(("slack", "growth"))]
     assert (std[determined] < 0.2).all()
-
-
-def test_a_batch_is_solved_like_single_sets(simulated):
-    problem = build_problem(simulated.session, free=FREE, prior=True)
-    rng = np.random.default_rng(8)
-    values = problem.values + 1e-6 * rng.normal(size=(2, problem.observations.size))
-    batch = BatchSolver(problem).solve(values, sigma=1e-6)
-    for row, theta in zip(values, batch.theta, strict=True):
-        alone = VariableProjection(problem).solve(sigma=1e-6, values=row)
-        assert (np.abs(theta - alone.theta) / problem.theta_scale).max() < 1e-6
 
 
 def test_estimates_of_slack_are_never_negative(plan):
@@ -428,12 +383,6 @@ def test_joined_sessions_share_the_machine_but_not_the_gauges(simulated):
     problem = build_problem(joined, free=FREE, prior=True)
     assert sum(n.endswith(".creep") for n in problem.free) == 12
     assert sum(n == "rods.growth" for n in problem.free) == 1
-    found = solutions(problem, 0.2e-6)
-    objective = found[0].objective
-    assert found[1].objective == pytest.approx(objective, rel=SAME_OPTIMUM)
-    # in prior std the objective grows at least by half the square of a distance from its minimum
-    off = np.linalg.norm((found[0].theta - found[1].theta) / problem.theta_scale)
-    assert off < np.sqrt(2.0 * SAME_OPTIMUM * objective)
 
 
 def test_readings_without_the_condition_are_refused(tmp_path):
@@ -457,11 +406,3 @@ def test_readings_without_the_condition_are_refused(tmp_path):
     some = replace(session, readings=(stated, *others))
     with pytest.raises(SessionError, match=f"{len(others)} of {len(others) + 1}"):
         identify(some, Choice(free=FREE), **QUICK)
-
-
-def test_a_session_file_keeps_the_conditions(simulated, tmp_path):
-    write_session(simulated.session, tmp_path / "out", decimals=12)
-    again = load_session(tmp_path / "out")
-    one, other = (build_problem(s, free=FREE, prior=True) for s in (simulated.session, again))
-    assert np.abs(one.values - other.values).max() < 1e-12
-    assert np.array_equal(one.states.commands, other.states.commands)

@@ -31,7 +31,7 @@ from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.runner import JOURNAL, open_results, run_study, to_parquet
 from orthocal.study.study import prepare_once, round_cell, run_task
 
-KILLS = 5
+KILLS = 3
 DRAWS = 30
 """Draws of each task."""
 FORK = multiprocessing.get_context("fork")
@@ -196,17 +196,6 @@ def test_progress(study):
     assert told[-1].seconds_left == 0.0
 
 
-def test_directory_of_another_study(study, root, tmp_path):
-    run_study(study, folder=tmp_path)
-    other = small_tasks(build_bootstrap_study(session_of(root), draws=12 * DRAWS, seed=1))
-    with pytest.raises(
-        OrthocalError, match=r"results\.jsonl: belongs to another study \(different: seed\)"
-    ):
-        run_study(other, folder=tmp_path)
-    found = run_study(other, folder=tmp_path, anew=True)
-    assert results(found) == results(run_study(other))
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -307,7 +296,7 @@ def test_a_cluster_with_a_killed_worker(cluster, study, undisturbed):
     assert results(found) == results(undisturbed)
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "", "tcp://["])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://["])
 def test_a_cluster_that_does_not_answer(study, address):
     """No client begins: its threads could block those of a later one."""
     before = threading.active_count()
