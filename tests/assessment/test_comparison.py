@@ -111,7 +111,9 @@ def test_doubtful_readings_get_no_recommendation(raw_cycles):
 
 def test_residuals_of_offsets_repeat(experiment_2):
     again = session_of("table1/experiment-3")
-    found = compare_models(experiment_2, models=["offsets"], repeat=again, options=QUICK)
+    found = compare_models(
+        experiment_2, models=["offsets"], repeat=again, options=QUICK, judgement=SOUND
+    )
     assert found.best is found["offsets"]  # the largest compared model
     assert found.repetition.repeats
     assert found.repetition.correlation == pytest.approx(0.9937, abs=5e-5)

@@ -280,15 +280,12 @@ def test_readings_are_judged_once(table1, judged):
     judgement = judge_session(session)
     stated = calibrate(session, "offsets", judgement=judgement, **QUICK)
     options = SolverOptions(**QUICK)
-    compared = compare_models(session, models=["offsets"], judgement=judgement, options=options)
+    compare_models(session, models=["offsets"], judgement=judgement, options=options)
     assert check_session(session, judgement=judgement).decision.verdict == "enter"
     assert judged == []
     judged_again = calibrate(session, "offsets", **QUICK).assessment
     assert judged_again.to_document() == stated.assessment.to_document()
     assert judged == [session]
-    again = compare_models(session, models=["offsets"], options=options)
-    assert again.assessment.to_document() == compared.assessment.to_document()
-    assert judged == [session, session]
 
 
 NOTES = {

@@ -367,21 +367,6 @@ def test_accuracy_is_under_stated_conditions(folder, calibration):
     )
 
 
-def test_a_stated_condition_does_not_change_the_others(calibration, workspace):
-    """The tool error is between those with constant and with varying conditions."""
-    both, at_25, from_one_side = (
-        assess_tool(calibration, workspace, conditions=c)
-        for c in (None, UseConditions(None, 25.0), UseConditions("ppp", 25.0, 2.0))
-    )
-    assert [set(a.use.varying) for a in (both, at_25, from_one_side)] == [
-        {"approach", "temperature", "payload"},
-        {"approach", "payload"},
-        set(),
-    ]
-    sizes = [a.measure(a.deviation_with_entries).aligned.rms for a in (from_one_side, at_25, both)]
-    assert sizes[0] < sizes[1] < sizes[2]
-
-
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, calibration):
     (folder / "part.ngc").write_text("G21\nG0 X0 Y0 Z0\nG0 X10 Y-20 Z5\n")
     words = ("correct", ".", "part.ngc", "--anyway", "--offsets", "active")

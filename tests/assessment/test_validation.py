@@ -222,10 +222,7 @@ def test_offsets_of_a_doubtful_calibration_are_not_to_be_entered(paper, experime
 def test_only_identified_offsets_must_be_active(experiment_3):
     choice = Choice(free=["x_slide.offset", "z_slide.offset"])
     calibration = calibrate(session_of("table1/experiment-2"), choice, **UNJUDGED)
-    entered = np.add(entered_offsets(calibration), [0.0, 0.3e-3, 0.0])
-    validation = validate_calibration(calibration, experiment_3.with_controller(entered))
-    assert validation.offsets_stated
-    entered[2] += 1e-3
+    entered = np.add(entered_offsets(calibration), [0.0, 0.3e-3, 1e-3])
     with pytest.raises(SessionError, match=r"controller\.offsets_mm: z_slide has"):
         validate_calibration(calibration, experiment_3.with_controller(entered))
 
@@ -252,29 +249,26 @@ def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3)
     assert result.assessment.decision.exit_code == 3
 
 
-@pytest.fixture(scope="module")
-def calibration(plan):
-    """Calibration of a machine without errors except offsets."""
-    return calibrate(simulate_session(plan, TRUTH, seed=1).session, **UNJUDGED)
-
-
-def test_several_sessions_are_validated_together(plan, calibration):
+def test_several_sessions_are_validated_together(plan):
     """They are joined, each with separate gauge zeros."""
+    errors, _, calibration = calibrated_machine("raw-cycles", None, 3)
     entered = plan.with_controller([e.enter for e in find_entries(calibration)])
-    days = [simulate_session(entered, TRUTH, seed=s).session for s in (2, 3)]
+    days = [simulate_session(entered, errors, seed=s).session for s in (2, 3)]
     both = validate_calibration(calibration, days)
     assert both.confirmed
     assert len(both.refit.residuals) == sum(len(d.readings) for d in days)
     assert both.repetition.matched == 18
 
 
-def test_each_of_several_sessions_must_have_the_offsets(plan, calibration):
+def test_each_of_several_sessions_must_have_the_offsets(plan):
+    errors, _, calibration = calibrated_machine("raw-cycles", None, 3)
     entered = [e.enter for e in find_entries(calibration)]
     sessions = [
-        simulate_session(plan.with_controller(offsets), TRUTH, seed=2).session
+        simulate_session(plan.with_controller(offsets), errors, seed=2).session
         for offsets in (entered, np.zeros(3))
     ]
-    with pytest.raises(SessionError, match=r"x_slide has 0 mm instead of 1\.199 mm"):
+    message = rf"x_slide has 0 mm instead of {entered[0] * 1e3:.3f} mm"
+    with pytest.raises(SessionError, match=message):
         validate_calibration(calibration, sessions)
 
 
@@ -469,7 +463,7 @@ def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(
 
 def test_a_wrong_new_reading_makes_a_validation_inconclusive(plan):
     """The answer names it and says nothing of deviations that it causes."""
-    errors, _, calibration = calibrated_machine("raw-cycles", None, 0)
+    errors, _, calibration = calibrated_machine("raw-cycles", None, 3)
     entered = plan.with_controller(entered_offsets(calibration))
     session = simulate_session(entered, errors, seed=2).session
     wrong = session.with_values(session.values + 0.3e-3 * (np.arange(len(session.values)) == 4))
@@ -487,7 +481,7 @@ def test_a_wrong_new_reading_makes_a_validation_inconclusive(plan):
 
 
 def test_new_readings_that_do_not_repeat_make_a_validation_inconclusive(plan):
-    errors, _, calibration = calibrated_machine("raw-cycles", "full", 3)
+    errors, _, calibration = calibrated_machine("raw-cycles", None, 3)
     entered = plan.with_controller(entered_offsets(calibration))
     session = simulate_session(entered, errors, seed=4, sigma=40e-6).session
     result = validate_calibration(calibration, session)

@@ -40,10 +40,6 @@ def sound(tmp_path_factory):
     return simulate_session(plan, errors_of(plan, 2), seed=2).session
 
 
-def reverse_setup(values, setup):
-    values[setup == "yz"] *= -1.0
-
-
 def reverse_one(values, setup):
     values[10] *= -1.0
 
@@ -62,7 +58,6 @@ def inches(values, setup):
 
 
 MISTAKES = {
-    reverse_setup: ("reversed sign", "yz"),
     reverse_one: ("reversed sign", "yz"),
     bump: ("displaced gauge", "zx"),
     swap: ("swapped rows", "xy"),

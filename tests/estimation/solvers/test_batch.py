@@ -40,11 +40,10 @@ BOUNDS = {"bounds": {"x_slide.offset": (-1e-3, 1e-3)}}
     ("loss", "given"),
     [
         ("squares", BOUNDS),
-        ("squares", {"known": {"y_slide.offset": (0.1e-3, 0.05e-3)}}),
         ("huber", {"prior": True}),
         ("huber", BOUNDS),
     ],
-    ids=["bounds", "known", "huber-prior", "huber-bounds"],
+    ids=["bounds", "huber-prior", "huber-bounds"],
 )
 def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
     session = exact(load_session(root / "examples/table1/experiment-2"))
@@ -74,9 +73,8 @@ def sweep(root):
     return build_problem(exact(load_session(root / "examples/sweep")), model="full")
 
 
-@pytest.mark.parametrize("loss", ["squares", "huber"])
-def test_many_parameters_are_solved_at_once(sweep, loss):
-    options = SolverOptions(loss=Loss(loss))
+def test_many_parameters_are_solved_at_once(sweep):
+    options = SolverOptions(loss=Loss("huber"))
     values, _ = draw(sweep, spread=1.0)
     values[:, 3] += 40e-6  # an outlier in each set
     found = BatchSolver(sweep, options=options).solve(values, sigma=SIGMA)

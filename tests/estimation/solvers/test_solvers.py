@@ -50,7 +50,7 @@ def solve_by_both(problem, *, loss, sigma, **options):
 COMPARED = [
     ("squares", "table1/experiment-1-printed", "full", "known"),
     ("squares", "raw-cycles", "offsets", "bounds"),
-    ("squares", "sweep", "full", "bounds"),
+    ("squares", "sweep", "lengths", "bounds"),
     ("huber", "table1/experiment-1-printed", "full", "plain"),
     ("huber", "raw-cycles", "lengths", "known"),
 ]
