@@ -76,12 +76,6 @@ def change(session, row, value):
     return session.with_values(values)
 
 
-def swap(session, one, other):
-    values = session.values.copy()
-    values[[one, other]] = values[[other, one]]
-    return session.with_values(values)
-
-
 def displace(session, setup, by):
     rows = [i for i, r in enumerate(session.readings) if r.setup == setup]
     values = session.values.copy()
@@ -111,7 +105,6 @@ VERDICTS = {
     "reversed sign": "review",
     "inches": "review",
     "resolution": "review",
-    "swapped rows": "review",
     "displaced gauge": "review",
     "drift": "review",
     "backlash": "review",
@@ -132,7 +125,6 @@ def cases(cycles, table1):
         "reversed sign": change(cycles, largest, -cycles.values[largest]),
         "inches": cycles.with_values(np.round(cycles.values / 25.4, 7)),
         "resolution": cycles.with_gauge(coarse),
-        "swapped rows": swap(cycles, 1, 2),
         "displaced gauge": displace(cycles, "yx", 0.2e-3),
         "drift": drift(cycles, 0.1e-3),
         "backlash": backlash,
@@ -203,7 +195,7 @@ def require_known_findings(findings):
 
 
 def test_the_readings_of_an_unfinished_session_are_judged(cycles, root, tmp_path):
-    """`check` counts the missing ones; `calibrate` and `compare` refuse and name their lines."""
+    """`check` counts the missing ones; `calibrate` refuses and names their lines."""
     wrong = reverse(cycles, "yx")
     read = [i for i, r in enumerate(wrong.readings) if r.setup in ("yx", "xy") or r.cycle == 1]
     missing = sorted(set(range(len(wrong.readings))) - set(read))
@@ -228,10 +220,9 @@ def test_the_readings_of_an_unfinished_session_are_judged(cycles, root, tmp_path
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stderr) == (0, "")
     assert "4 of 54 readings are missing (lines 5, 7 to 9)." in done.stdout
-    for command in (["calibrate", "."], ["compare", "."]):
-        done = run_orthocal(tmp_path, *command)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert "readings.csv: 4 of 54 readings are missing (lines 5, 7 to 9); " in done.stderr
+    done = run_orthocal(tmp_path, "calibrate", ".")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "readings.csv: 4 of 54 readings are missing (lines 5, 7 to 9); " in done.stderr
     path.write_text("\n".join([lines[0], *(x.rpartition(",")[0] + "," for x in lines[1:])]) + "\n")
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stdout) == (2, "")
