@@ -291,7 +291,9 @@ NOTES = {
     "compensation not stated, common approach": lambda c, t: calibrate(
         replace(
             c.with_effects(["backlash"]),
-            readings=tuple(replace(r, conditions=Conditions("ppp")) for r in c.readings),
+            readings=tuple(
+                replace(r, conditions=Conditions("ppp")) for r in c.readings if r.cycle == 1
+            ),
         ),
         **QUICK,
     ),

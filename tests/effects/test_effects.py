@@ -13,7 +13,7 @@ from derivatives import assert_derivative
 from effect_plans import write_plan, write_robot
 from gauges import exact
 from slack import Slack
-from tolerances import CLOSED, DERIVATIVE, KINEMATICS, SAME_OPTIMUM
+from tolerances import CLOSED, DERIVATIVE, SAME_OPTIMUM
 
 from orthocal import (
     Choice,
@@ -270,22 +270,6 @@ def test_the_jacobian_is_that_of_the_readings(problem):
     size = np.maximum(np.abs(numeric).max(axis=0), 1e-9)
     assert (np.abs(jacobian - numeric) / size).max() < 10 * DERIVATIVE
     assert (np.abs(jacobian).max(axis=0) > 0.0).all()
-
-
-def test_batches_have_the_same_jacobians(problem):
-    thetas = np.array([point(problem, size) for size in (0.2, 0.6)])
-    passive = problem.close(thetas)
-    readings, jacobians = problem.predict_and_jacobian(thetas, passive)
-    batch = problem.linearise(thetas, passive)
-    rng = np.random.default_rng(5)
-    change = 1e-4 * rng.normal(size=thetas.shape)
-    for i, theta in enumerate(thetas):
-        alone, jacobian = problem.predict_and_jacobian(theta, passive[i])
-        assert np.abs(jacobians[i] - jacobian).max() < KINEMATICS
-        assert np.abs(readings[i] - problem.predict(theta, passive[i])).max() < KINEMATICS
-        closed = problem.close(theta + change[i] * problem.theta_scale)
-        assert np.abs(passive[i] + batch.follow(change)[i] - closed).max() < 1e-9
-        assert np.abs(alone - readings[i]).max() < KINEMATICS
 
 
 def test_the_derivatives_of_the_error_map_are_exact(plan):
