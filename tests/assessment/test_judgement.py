@@ -281,7 +281,7 @@ def test_readings_are_judged_once(table1, judged):
 
 NOTES = {
     "model error": lambda c, t: calibrated("table1/experiment-2"),
-    "no redundancy": lambda c, t: calibrated("raw-cycles", "full"),
+    "no redundancy": lambda c, t: calibrated("raw-cycles", "full", **UNJUDGED),
     "noise unknown": lambda c, t: calibrate(
         t["2"].select(t["2"].readings[1:4]).with_gauge(Gauge(None, None, None)), **UNJUDGED
     ),

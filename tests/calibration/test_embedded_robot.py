@@ -66,14 +66,12 @@ def mill(made, tmp_path):
 
 
 COMMANDS = """
-export calibration.json --to urdf --out urdf
 export calibration.json --to linuxcnc --out linuxcnc
 correct calibration.json part.ngc --work-offset-mm 0,0,0 --out corrected.ngc
 forward calibration.json joints.csv
 view calibration.json --html scene.html
 report calibration.json
 again calibration.json --out second
-view second --html second.html
 """
 FILES = {
     "joints.csv": "x_slide_mm,y_slide_mm,z_slide_mm\n310,310,310\n",
