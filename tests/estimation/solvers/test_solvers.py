@@ -52,7 +52,6 @@ COMPARED = [
     ("squares", "raw-cycles", "offsets", "bounds"),
     ("squares", "sweep", "lengths", "bounds"),
     ("huber", "table1/experiment-1-printed", "full", "plain"),
-    ("huber", "raw-cycles", "lengths", "known"),
 ]
 """Each loss, example, model and choice, with large outliers in the first example."""
 
