@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -149,13 +148,25 @@ def no_sensor_gains():
         yield
 
 
+@contextmanager
+def plans_of_few_candidates():
+    """Plans of commands with few candidates and one start; tests/planning verify plans."""
+
+    def plan_readings(*args, starts=None, **options):
+        return plan(*args, starts=1, **options)
+
+    plan, equipment = orthocal.plan_readings, orthocal.Equipment
+    with (
+        patch.object(orthocal, "Equipment", lambda **stated: equipment(**stated | FEW)),
+        patch.object(orthocal, "plan_readings", plan_readings),
+    ):
+        yield
+
+
 @pytest.fixture(scope="module")
 def quick_plans():
-    """Plans of `orthocal new` with few candidates and one start; tests/planning verify plans."""
-    with (
-        patch.object(orthocal, "Equipment", partial(orthocal.Equipment, **FEW)),
-        patch.object(orthocal, "plan_readings", partial(orthocal.plan_readings, starts=1)),
-    ):
+    """Plans of `orthocal new` with few candidates and one start."""
+    with plans_of_few_candidates():
         yield
 
 

@@ -546,18 +546,19 @@ def test_sessions_with_the_same_readings_are_refused(days, tmp_path):
     assert f"{monday}/session.yaml except line 3: a copy" in err
 
 
-@pytest.mark.parametrize("calibrated", ["monday", "both"])
-def test_copies_of_calibrated_sessions_do_not_validate(days, tmp_path, calibrated):
+@pytest.mark.parametrize("several", [False, True], ids=["one session", "two sessions"])
+def test_copies_of_calibrated_sessions_do_not_validate(days, tmp_path, several):
     """With all readings, and with one of them changed."""
-    folder, _ = days
-    names = ("monday",) if calibrated == "monday" else ("monday", "tuesday")
-    words = ("calibrate", *(folder / n for n in names), "--out", tmp_path / "one")
-    assert orthocal(*words)[0] == 0
-    copy = shutil.copytree(folder / names[-1], tmp_path / "copy")
+    one, session = days[0] / "out", days[0] / "tuesday"
+    if not several:
+        one = tmp_path / "one"
+        words = ["--solver", "linearised", "--out", one]
+        assert orthocal("calibrate", session, *words).returncode == 0
+    copy = shutil.copytree(session, tmp_path / "copy")
     with (copy / "session.yaml").open("a") as stream:
         stream.write("# after entering\n")
-    original = f"{folder / names[-1]}/session.yaml"
-    code, out, err = orthocal("validate", tmp_path / "one", copy)
+    original = f"{session}/session.yaml"
+    code, out, err = orthocal("validate", one, copy)
     assert (code, out) == (2, "")
     assert err == (
         f"orthocal: {copy}/readings.csv: has the same readings as {original}: a copy that was not "
@@ -566,10 +567,10 @@ def test_copies_of_calibrated_sessions_do_not_validate(days, tmp_path, calibrate
     head, *rows = (copy / "readings.csv").read_text().splitlines()
     rows[1] += "1"
     (copy / "readings.csv").write_text("\n".join([head, *rows]) + "\n")
-    code, _, err = orthocal("validate", tmp_path / "one", copy)
+    code, _, err = orthocal("validate", one, copy)
     assert code == 2
     assert f"{original} except line 3: a copy" in err
-    code, _, err = orthocal("validate", tmp_path / "one", folder / names[-1])
+    code, _, err = orthocal("validate", one, session)
     assert "belongs to the calibration itself" in err
 
 

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from commands import run_here, run_line, run_orthocal, run_script
-from conftest import ROOT, marked_reports, no_sensor_gains
+from conftest import ROOT, marked_reports, no_sensor_gains, plans_of_few_candidates
 
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
@@ -50,6 +50,9 @@ WITH_REPORTS = ("README.md", "docs/viewing.md")
 
 SHOWN = {"docs/adjusting.md": 3, "docs/controllers.md": 3, "docs/measuring.md": 2}
 """Pages that show what commands print, with the number of texts; plans of others start once."""
+
+WITH_ALL_CANDIDATES = (*SHOWN, "docs/planning.md")
+"""Pages that show results of plans."""
 
 
 def blocks(language, page):
@@ -132,7 +135,8 @@ def run_page(make_directory, short_reports):
         printed.directory = make_directory()
         reports = nullcontext() if page in WITH_REPORTS else marked_reports()
         plans = nullcontext() if page in SHOWN else patch.object(selection, "MIN_STARTS", 1)
-        with reports, plans, no_sensor_gains():
+        few = nullcontext() if page in WITH_ALL_CANDIDATES else plans_of_few_candidates()
+        with reports, plans, few, no_sensor_gains():
             for command, expected in commands(page):
                 done = run_line(printed.directory, command)
                 assert done.returncode == expected, f"{command}: {done.stderr}"

@@ -157,10 +157,10 @@ def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
         f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
-    text = f"Enter these offsets of the slides, unless they are entered already: {offsets}."
+    text = f"Enter these offsets of the drives, unless they are entered already: {offsets}."
     if changes:
         text = (
-            f"Add these to the active offsets of the slides, unless they are added already: "
+            f"Add these to the active offsets of the drives, unless they are added already: "
             f"{offsets}. The new session.yaml states these changes, since the calibrated session "
             "states no offsets (`controller`)."
         )

@@ -28,7 +28,10 @@ LARGEST_ENTRY = 8 * 2**20
 """Largest size of one file, [bytes]."""
 
 MOST_ENTRIES = 400
-"""Largest number of files."""
+"""Largest number of files, exceeded by those stored since unused ones were last removed."""
+
+CHECKED = "0"
+"""Begin of the names of files after whose storage unused ones are removed: one in 16."""
 
 _SUFFIX = ".kept"
 _MAGIC = b"orthocal cache 1\n"
@@ -61,7 +64,8 @@ def store(key: str, content: bytes) -> None:
     with suppress(OSError, ValueError), _opened_folder(create=True) as folder:
         if folder is not None:
             _write(folder, key, content)
-            _remove_unused(folder)
+            if _name(key).startswith(CHECKED):
+                _remove_unused(folder)
 
 
 def cache_folder() -> Path | None:

@@ -122,6 +122,7 @@ def test_a_file_of_another_key_is_not_trusted(folder):
 
 
 def test_the_size_is_bounded(folder, monkeypatch):
+    monkeypatch.setattr(cache, "CHECKED", "")
     monkeypatch.setattr(cache, "LARGEST_TOTAL", 1000)
     for i in range(10):
         cache.store(f"key {i}", bytes(200))
@@ -137,7 +138,17 @@ def test_the_size_is_bounded(folder, monkeypatch):
     assert cache.load("key 11") is None
 
 
+def test_many_files_are_removed_now_and_then(folder, monkeypatch):
+    monkeypatch.setattr(cache, "MOST_ENTRIES", 20)
+    counts = []
+    for i in range(200):
+        cache.store(f"key {i}", b"")
+        counts.append(len(list(folder.iterdir())))
+    assert 20 < max(counts) < 100
+
+
 def test_what_was_used_lately_is_kept(folder, monkeypatch):
+    monkeypatch.setattr(cache, "CHECKED", "")
     monkeypatch.setattr(cache, "MOST_ENTRIES", 2)
     for i in range(2):
         cache.store(f"key {i}", b"")

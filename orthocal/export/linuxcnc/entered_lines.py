@@ -65,7 +65,7 @@ def describe_other_lines(
             ]
         )
         sentences.append(
-            f"{file} has HOME_OFFSET for other offsets of the slides than the new session: "
+            f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
             f"{values}. Enter those of the session, or use the lines of this calibration's export."
         )
     if differences := compare_joints(_pair_trims(calibration, compensation)):

@@ -45,7 +45,7 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
     """
     lines = [
         "# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines.",
-        "# With these lines a session states the offsets of the slides:",
+        "# With these lines a session states the offsets of the drives:",
         f"# {_describe_offsets(calibration)}",
     ]
     for i, home in enumerate(homes):

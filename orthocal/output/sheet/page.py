@@ -155,7 +155,7 @@ def _front(
         "counting is wrong: correct it in machine.yaml (`orthocal new DIRECTORY --again`) or in "
         "the robot's YAML. From now on, drive to the numbers printed here, not by eye. Travel of "
         f"the joints: {'; '.join(_travel(session))}.",
-        f"Jog each slide a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
+        f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
         "Check each rod and each hinge for play. The calibration does not remove play.",

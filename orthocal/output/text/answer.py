@@ -423,7 +423,7 @@ def render_values(calibration: Calibration) -> RenderableType:
         notes.append(
             "For a controller that corrects nothing else the best value is "
             f"`{'best' if keep else 'new'}`; it compensates a part of the other errors. "
-            "identified: offset of the slide, for a controller that corrects all identified errors."
+            "identified: offset of the drive, for a controller that corrects all identified errors."
         )
     return noted(Group() if complete else table, *notes)
 

@@ -109,7 +109,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
     notes = []
     if not c.only_offsets and assessment_of(c).entries:
         enter = " to enter" * (assessment_of(c).decision.verdict == "enter")
-        notes.append(f"Offsets of the slides. The best ones{enter} differ: see {name_values(c)}.")
+        notes.append(f"Offsets of the drives. The best ones{enter} differ: see {name_values(c)}.")
     if omitted:
         notes.append(f"{omitted} more are resolved by less than half; --all lists them.")
     held = [p for p in c.parameters if not p.free]
