@@ -544,12 +544,12 @@ def test_periodic_errors_are_inverted_exactly():
 SPACING = 0.1
 """Distance of the points at which a corrected program is followed, [mm]."""
 
-SHORT = [*CORNERS[:2], (8.0, 0.0, 5.0), (10.0, -12.0, 20.0)]
-PART = CENTRE, RADIUS, SHORT
+SHORT = [*CORNERS[:2], (18.0, -4.0, 9.0), (16.0, -10.0, 13.0)]
+PART = (24.0, -8.0, 15.0), 4.0, SHORT
 PROGRAM = [
     "G21 G90 G0 X{:g} Y{:g} Z{:g}".format(*SHORT[0]),
     "G1 X28 Y-8 Z15 F600",
-    "G2 X28 Y-8 Z15 I-16 J0",
+    "G2 X28 Y-8 Z15 I-4 J0",
     *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in SHORT[2:]),
 ]
 

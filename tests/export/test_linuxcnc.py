@@ -19,7 +19,6 @@ from calibrated import UNJUDGED
 from commands import run_orthocal
 from linuxcnc import (
     Joint,
-    build_module,
     enter_lines,
     filter_program,
     require_linuxcnc,
@@ -379,24 +378,6 @@ def test_bad_options_are_refused(offsets, tmp_path, words, code, message):
 # ---- HOME_OFFSET
 
 
-def test_home_offset_follows_direction_and_active_offsets(offsets):
-    """HOME_OFFSET and limits agree with a calculation by hand."""
-    old = (0.35, 0.3, 0.02)
-    homes = homes_of(offsets, old=old)
-    change = (np.array(list(OFFSETS.values())) - ACTIVE) * [1, -1, -1]
-    assert [h.change for h in homes] == pytest.approx(change, abs=1e-9)
-    assert [h.new for h in homes] == pytest.approx(np.array(old) + change, abs=1e-9)
-    # travel from 120 to 390 mm of the encoders
-    for home, drive, active, now in zip(
-        homes, offsets.robot.drives, ACTIVE, OFFSETS.values(), strict=True
-    ):
-        ends = [0.12, 0.39]
-        assert sorted(drive.to_joint(np.array(ends) + active)) == pytest.approx(home.limits)
-        assert sorted(drive.to_joint(np.array(ends) + now)) == pytest.approx(
-            home.new_limits, abs=1e-9
-        )
-
-
 def test_unknown_home_offsets_are_written_as_changes(offsets):
     files = export_calibration(offsets, "linuxcnc")
     assert list(files) == ["README.md", "joints.ini"]
@@ -474,9 +455,9 @@ def test_offsets_of_a_complete_model(full):
 # ---- LinuxCNC itself
 
 
-def homes_of(calibration, old=None):
+def homes_of(calibration):
     new, before = (f(calibration, None) for f in (find_compensation, find_active_compensation))
-    return find_homes(calibration, new, before, old=old)
+    return find_homes(calibration, new, before)
 
 
 def from_pieces(points, centre, radius, corners):
@@ -626,11 +607,3 @@ def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
     assert np.linalg.norm(machine.forward(slides[-1] * MM) - point) < ENTERED
     # with the previous offsets the error is large
     assert np.linalg.norm(machine.forward(drives - ACTIVE) - point) > 0.5 * MM
-
-
-def test_module_is_built_without_warnings(exported, tmp_path):
-    require_linuxcnc()
-    for name, text in exported.items():
-        (tmp_path / name).write_text(text)
-    build_module(tmp_path)
-    assert (tmp_path / "orthocal_kins.so").exists()

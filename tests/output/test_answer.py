@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
-from calibrated import calibrated, session_of
+from calibrated import UNJUDGED, calibrated, session_of
 from conftest import marked_plots
 from machines import write_orthoglide
 from rich.console import Group
@@ -86,6 +86,10 @@ def outliers(session):
     return session.with_values(values)
 
 
+def without_tool(session):
+    return replace(session, robot=replace(session.robot, tcp=None))
+
+
 def judged(session, choice=None, **options):
     """Calibration by variable projection."""
     return calibrate(session, choice, **{"solver": "variable-projection", **options})
@@ -94,10 +98,10 @@ def judged(session, choice=None, **options):
 OTHERS = {
     "turned": lambda a: judged(reversed_sign(a.cycles, "zx")),
     "huber": lambda a: judged(outliers(a.cycles), loss="huber"),
-    "full": lambda a: calibrated("sweep", "full"),
-    "250 mm": lambda a: judged(machine_of_250_mm(a.directory), "offsets"),
-    "no tool": lambda a: judged(replace(a.cycles, robot=replace(a.cycles.robot, tcp=None))),
-    "no offset": lambda a: judged(a.cycles, Choice(free=["x_leg.length"])),
+    "full": lambda a: calibrated("sweep", "full", **UNJUDGED),
+    "250 mm": lambda a: calibrate(machine_of_250_mm(a.directory), "offsets", **UNJUDGED),
+    "no tool": lambda a: calibrate(without_tool(a.cycles), **UNJUDGED),
+    "no offset": lambda a: calibrate(a.cycles, Choice(free=["x_leg.length"]), **UNJUDGED),
 }
 """Other calibrations: mistakes in the readings, other machines and models."""
 

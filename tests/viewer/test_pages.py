@@ -328,7 +328,7 @@ def test_no_text_of_a_plot_is_cut_off(browser, tmp_path):
 
 def test_picture_has_the_requested_size(tmp_path):
     require_browser()
-    width, height = 480, 360
+    width, height = 240, 180
     text = scene_of(EXPERIMENT_2).to_html()
     path = take_picture(text, tmp_path / "a.png", width=width, height=height)
     with Image.open(path) as image:
