@@ -20,6 +20,7 @@ from commands import run_orthocal
 from linuxcnc import (
     Joint,
     enter_lines,
+    few_nodes,
     filter_program,
     require_linuxcnc,
     run_program,
@@ -311,14 +312,18 @@ def test_braced_writes_all_digits():
 
 
 def test_unreachable_tolerance_is_refused_with_the_best_error(full):
-    with pytest.raises(ExportError, match=r"within 1e-09 µm over ±60 mm; the smallest error is"):
+    with (
+        few_nodes(),
+        pytest.raises(ExportError, match=r"within 1e-09 µm over ±60 mm; the smallest error is"),
+    ):
         approximate(full, within=1e-15)
     with pytest.raises(ExportError, match=r"does not reach ±150 mm \(.*smaller --half-side-mm"):
         approximate(full, within=1e-6, half_side=0.15)
 
 
 def test_larger_tolerance_gives_a_lower_degree(full, exported):
-    approximation = approximate(full, within=5e-6)
+    with few_nodes():
+        approximation = approximate(full, within=5e-6)
     assert (
         f"#define DEGREE {approximation.inverse.correction.degree}\n"
         not in exported["orthocal_core.c"]
@@ -425,7 +430,8 @@ def test_module_files_state_tool_limits_and_error(full, exported):
 def test_module_of_offsets_alone(offsets):
     """The correction of nominal legs is constant, and HOME_OFFSET does not change."""
     options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
-    files = export_calibration(offsets, "linuxcnc", options=options)
+    with few_nodes():
+        files = export_calibration(offsets, "linuxcnc", options=options)
     assert "identified offsets only; a module was requested" in files["README.md"]
     assert "(JOINT_0 350.000, JOINT_1 300.000, JOINT_2 -20.000)" in files["README.md"]
     assert "HOME_OFFSET = 300.000\n" in files["kinematics.ini"]
@@ -561,7 +567,8 @@ def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filt
     assert progress == sorted(progress)
     nominal = calibrated(root, mixed, "raw-cycles", {}, "offsets", active=np.zeros(3))
     options = ExportOptions(module=True)
-    files = export_calibration(nominal, "linuxcnc", anyway=True, options=options)
+    with few_nodes():
+        files = export_calibration(nominal, "linuxcnc", anyway=True, options=options)
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     slides = run_program(

@@ -13,7 +13,7 @@ import pytest
 from calibrated import SOUND
 from effect_plans import write_plan, write_robot
 from independent import Expansion, IndependentMachine, States
-from linuxcnc import require_linuxcnc, run_programs
+from linuxcnc import few_nodes, require_linuxcnc, run_programs
 from loaded_orthoglide import settle
 from test_linuxcnc import SWITCH, Core, homes_of, joints_at_switch, joints_of, machine_of
 
@@ -82,6 +82,12 @@ def build(tmp_path, known, *, periodic=False, within=WITHIN, half_side=0.06, **o
     approximation = approximate(known, within=within, half_side=half_side, **options)
     files = write_core(known, approximation, homes_of(known))
     return approximation, ThermalCore(tmp_path, files, periodic=periodic)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cheap_modules():
+    with few_nodes(degree=6):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -458,7 +458,6 @@ controller: {offsets_mm: [0, 0, 0]}
 gauges: {tracker: {sigma_mm: 0.01}, dial: {sigma_mm: 0.005}}
 postures:
 """
-AXES = "xyz"
 
 
 @pytest.fixture

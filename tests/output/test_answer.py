@@ -58,17 +58,10 @@ class Answers(dict):
     def __init__(self, directory):
         super().__init__()
         self.directory, self.cycles = directory, session_of("raw-cycles")
-        self._complete = {}
 
     def __missing__(self, name):
         self[name] = calibrated(name, EXAMPLES[name]) if name in EXAMPLES else OTHERS[name](self)
         return self[name]
-
-    def complete(self, name):
-        """All that is printed about a calibration, in words; its tool errors take time."""
-        if name not in self._complete:
-            self._complete[name] = words_of(self[name], all_rows=True)
-        return self._complete[name]
 
 
 def words_of(calibration, **options):
@@ -116,9 +109,19 @@ def answers(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_an_answer_is_short_and_in_plain_words(answers, name):
+def test_an_answer_is_short_in_order_and_states_all_that_decides(answers, name):
+    calibration = answers[name]
+    text, details = words_of(calibration), words_of(calibration, all_rows=True)
+    assert_short(calibration)
+    assert_order(calibration, text, leg="250" if name == "250 mm" else "310.25")
+    assert_findings(calibration.assessment, text, details)
+    assert_tool_error(calibration, text, details)
+
+
+def assert_short(calibration):
+    """In plain words, whatever the width of the terminal."""
     for width in (80, 100):
-        text = to_text(render_calibration(answers[name]), width=width)
+        text = to_text(render_calibration(calibration), width=width)
         assert len(text.splitlines()) <= MOST_LINES
         assert max(len(line) for line in text.splitlines()) <= width
         for word in NOT_SAID:
@@ -128,14 +131,12 @@ def test_an_answer_is_short_and_in_plain_words(answers, name):
         assert "\n\n\n" not in text
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_the_order_is_subject_decision_and_next_step(answers, name):
-    calibration = answers[name]
+def assert_order(calibration, text, *, leg):
+    """Subject, decision and next step."""
     found = calibration.assessment
-    text = words_of(calibration)
     parts = [
         f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
-        f"Machine: legs of {'250' if name == '250 mm' else '310.25'} mm, travel",
+        f"Machine: legs of {leg} mm, travel",
         "Measured: ",
         f"{found.decision.headline} {found.decision.reason}",
         *(f.text for f in found.of_kind("tool error") if found.decision.verdict == "enter"),
@@ -149,21 +150,35 @@ def test_the_order_is_subject_decision_and_next_step(answers, name):
         assert f"Next: {found.decision.action}".strip() in text
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_all_findings_that_decide_are_listed(answers, name):
+def assert_findings(found, text, details):
     """Whatever decides is shown, up to the most that are listed, the gravest first."""
-    found = answers[name].assessment
-    text = words_of(answers[name])
     grave = [f for f in found.findings if f.severity != "note"]
     for finding in grave[: MOST_LISTED + 1]:
         assert " ".join(finding.text.split()) in text
     order = {"reject": 0, "review": 1, "note": 2}
     ranks = [order[f.severity] for f in found.findings]
     assert ranks == sorted(ranks)
-    details = answers.complete(name)
     omitted = () if found.decision.verdict == "enter" else RECOMMENDING
     listed = [f for f in found.findings if f.kind not in omitted]
     assert all(" ".join(f.text.split()) in details for f in listed)
+
+
+def assert_tool_error(calibration, text, details):
+    """In one sentence everywhere: the short answer, the section of the tool and the findings."""
+    found = calibration.assessment
+    if found.tool is None:
+        assert found.of_kind("out of reach")[0].text in text
+        return
+    sentence = describe_tool_error(found.tool, keep=found.keeps_offsets)
+    (stated,) = found.of_kind("tool error")
+    assert stated.text == sentence
+    assert stated.numbers["entered_um"] == pytest.approx(found.tool.entered * 1e6)
+    shown = found.decision.verdict == "enter"
+    assert text.count(sentence) == shown
+    assert details.count(sentence) == 3 * shown
+    assert ("With all identified errors corrected: " in text) == (
+        shown and not calibration.only_offsets
+    )
 
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles"])
@@ -201,26 +216,6 @@ def test_doubtful_readings_offer_nothing_to_enter(answers, name, verdict):
     assert "x_slide" in details.partition("\nValues (do not enter them)\n")[2].split()
     (tool,) = calibration.assessment.of_kind("tool error")
     assert not any(tool.text in text for text in (short, details))
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_one_tool_error_in_one_sentence_everywhere(answers, name):
-    calibration = answers[name]
-    found = calibration.assessment
-    if found.tool is None:
-        assert found.of_kind("out of reach")[0].text in words_of(calibration)
-        return
-    sentence = describe_tool_error(found.tool, keep=found.keeps_offsets)
-    (stated,) = found.of_kind("tool error")
-    assert stated.text == sentence
-    assert stated.numbers["entered_um"] == pytest.approx(found.tool.entered * 1e6)
-    shown = found.decision.verdict == "enter"
-    assert words_of(calibration).count(sentence) == shown
-    # the short answer, the section of the tool and the findings
-    assert answers.complete(name).count(sentence) == 3 * shown
-    assert ("With all identified errors corrected: " in words_of(calibration)) == (
-        shown and not calibration.only_offsets
-    )
 
 
 def test_offsets_that_need_no_change_stay(answers):

@@ -264,14 +264,6 @@ def test_gauges_touch_the_leg_at_their_section(scene, calibration):
         assert stem == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
 
 
-def test_labels_say_setup_millimetres_and_postures(scene, calibration):
-    texts = [label.texts[0] for label in scene.labels if label.rank >= 0.0]
-    assert len(texts) == 6
-    row = next(r for r in calibration.residuals if r.setup == "zx")
-    assert f"zx −1.140 → −{abs(row.residual) * 1e3:.3f} mm\nx_max − x_min" in texts
-    assert scene.headline.startswith("Leg x is furthest from parallel: −1.140 mm at gauge zx")
-
-
 def test_scene_states_the_offsets_to_enter(scene, calibration):
     """The leg with the largest deviation, x, is not the one with the largest offset, z."""
     fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
@@ -535,19 +527,6 @@ def test_loaded_calibration_makes_the_same_page(calibration, scene, tmp_path):
 
 def test_the_page_is_what_meshcats_own_interface_gives(scene):
     assert scene.visualizer.static_html() == scene.to_html()
-
-
-TAKEN = ("constructor", "__proto__", "toString", "hasOwnProperty", "<object>")
-
-
-def test_reserved_names_of_the_viewer_are_not_used_for_nodes(raw_cycles):
-    """The viewer keeps nodes in plain JavaScript objects, which have some keys already."""
-    names = dict(zip(list(raw_cycles.setups)[: len(TAKEN)], TAKEN, strict=True))
-    scene = draw_scene(rename_setups(raw_cycles, names))
-    parts = {part for path in scene.nodes for part in path.split("/")}
-    assert {f"{name} (name)" for name in TAKEN} <= parts
-    assert not parts & set(TAKEN)
-    assert len(scene.nodes) == len(draw_scene(raw_cycles).nodes)
 
 
 def test_links_with_any_name_move(root, tmp_path):
