@@ -79,7 +79,8 @@ class ThermalCore(Core):
 
 
 def build(tmp_path, known, *, periodic=False, within=WITHIN, half_side=0.06, **options):
-    approximation = approximate(known, within=within, half_side=half_side, **options)
+    with few_nodes(degree=4 if half_side == SMALL else 6):
+        approximation = approximate(known, within=within, half_side=half_side, **options)
     files = write_core(known, approximation, homes_of(known))
     return approximation, ThermalCore(tmp_path, files, periodic=periodic)
 

@@ -130,7 +130,7 @@ def test_an_error_in_a_worker_process_is_reported(monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux only")
 def test_an_interrupted_plan_ends_its_worker_processes(tmp_path):
     out = tmp_path / "monday"
-    many = [*QUICK[:-1], "1000", "--workers", "2"]
+    many = ["--along", "5", "--sections", "0.5", "--starts", "100", "--workers", "2"]
     words = ["plan", "orthoglide", *many, "--out", str(out)]
     run = subprocess.Popen(
         [sys.executable, "-m", "orthocal", *words],
