@@ -49,8 +49,14 @@ FIRST = datetime(2025, 3, 14, 8)
 BETWEEN = timedelta(minutes=1)
 
 
-def write_plan(folder):
-    """A plan of 60 readings with conditions, on a machine with all effects."""
+def write_plan(folder, *, between=BETWEEN, growing=False):
+    """A plan of 60 readings with conditions, on a machine with all effects.
+
+    Args:
+        folder: Directory to write.
+        between: Time between two readings.
+        growing: Let the temperature grow with the time; otherwise it goes up and down.
+    """
     write_robot(folder / "machine", KEYS)
     postures, setups = {}, {}
     rows = ["setup,posture,reading_mm,approach,temperature_C,time"]
@@ -69,8 +75,8 @@ def write_plan(folder):
             for letter in "pn":
                 k = len(rows) - 1
                 approach = "".join(letter if j == name[1] else "pn"[(i + k) % 2] for j in "xyz")
-                warm = COOLEST + (WARMEST - COOLEST) * ((7 * k) % 60) / 59
-                when = (FIRST + k * BETWEEN).isoformat()
+                warm = COOLEST + (WARMEST - COOLEST) * (k if growing else (7 * k) % 60) / 59
+                when = (FIRST + k * between).isoformat()
                 rows.append(f"{name},{name[1]}{d:+.0f},0.0,{approach},{warm:.1f},{when}")
     plan = {"robot": "machine", "gauge": {"sigma_mm": 1e3 * SIGMA, "range_mm": [-20, 20]}}
     plan |= {"postures": postures, "setups": setups, "readings": "readings.csv"}

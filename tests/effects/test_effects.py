@@ -9,11 +9,11 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from derivatives import assert_derivative
+from derivatives import assert_derivative, central_differences
 from effect_plans import write_plan, write_robot
 from gauges import exact
 from slack import Slack
-from tolerances import CLOSED, DERIVATIVE, SAME_OPTIMUM
+from tolerances import CLOSED, DERIVATIVE, KINEMATICS, SAME_OPTIMUM
 
 from orthocal import (
     Choice,
@@ -29,6 +29,7 @@ from orthocal.effects import registry
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.rods import stretch_rod
 from orthocal.errors import OrthocalError, ParameterError, RobotError, SessionError
+from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
@@ -272,6 +273,22 @@ def test_the_jacobian_is_that_of_the_readings(problem):
     assert (np.abs(jacobian).max(axis=0) > 0.0).all()
 
 
+def test_batches_have_the_same_jacobians(problem):
+    thetas = np.array([point(problem, size) for size in (0.2, 0.6)])
+    passive = problem.close(thetas)
+    readings, jacobians = problem.predict_and_jacobian(thetas, passive)
+    batch = problem.linearise(thetas, passive)
+    rng = np.random.default_rng(5)
+    change = 1e-4 * rng.normal(size=thetas.shape)
+    for i, theta in enumerate(thetas):
+        alone, jacobian = problem.predict_and_jacobian(theta, passive[i])
+        assert np.abs(jacobians[i] - jacobian).max() < KINEMATICS
+        assert np.abs(readings[i] - problem.predict(theta, passive[i])).max() < KINEMATICS
+        closed = problem.close(theta + change[i] * problem.theta_scale)
+        assert np.abs(passive[i] + batch.follow(change)[i] - closed).max() < 1e-9
+        assert np.abs(alone - readings[i]).max() < KINEMATICS
+
+
 def test_the_derivatives_of_the_error_map_are_exact(plan):
     """Twists and drives under conditions, by every error and by the commanded coordinates."""
     map_ = error_map(plan.robot)
@@ -303,6 +320,37 @@ def test_the_tool_sensitivity_and_the_inverse_are_exact(plan):
     )
     closure = LoopClosure(plan.robot, fixed=at)
     assert np.abs(closure.inverse(closure.forward(drives)) - drives).max() < CLOSED
+
+
+def test_the_program_has_exact_derivatives(problem):
+    program = NonlinearProgram(problem, options=SolverOptions(hessian="exact"))
+    f, theta = program.functions(), point(problem)
+    x, p = program.initial_variables(theta, sigma=1e-4), program.parameter_values(sigma=1e-4)
+    rng = np.random.default_rng(4)
+    along = rng.normal(size=(x.size, 6))
+    along /= np.linalg.norm(along, axis=0)
+    lam = rng.normal(size=f["nlp"].size1_out(1))
+    gradient = np.asarray(f["grad_f"](x, p)[1]).ravel()
+    jacobian = np.asarray(f["jac_g"](x, p)[1].full())
+
+    def both(t):
+        objective, closure = f["nlp"](x + along @ t, p)
+        return np.r_[float(objective), np.asarray(closure).ravel()]
+
+    numeric = central_differences(both, np.zeros(6), step=1e-4)
+    found = np.vstack([gradient @ along, jacobian @ along])
+    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
+    assert (np.abs(found - numeric) / scale).max() < DERIVATIVE
+
+    def slope(t):
+        gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
+        return gradient + np.asarray(ca.mtimes(f["jac_g"](x + along @ t, p)[1].T, lam)).ravel()
+
+    upper = np.asarray(f["hess_lag"](x, p, 1.0, lam).full())
+    hessian = upper + np.triu(upper, 1).T
+    numeric = central_differences(slope, np.zeros(6), step=1e-4)
+    size = max(1.0, np.abs(numeric).max())
+    assert np.abs(hessian @ along - numeric).max() / size < DERIVATIVE
 
 
 # ---- identification

@@ -5,6 +5,8 @@ A sample of `tests/benchmarks/effects.py`.
 
 from __future__ import annotations
 
+from datetime import timedelta
+
 import numpy as np
 import pytest
 from effect_machines import (
@@ -50,6 +52,15 @@ def test_intervals_and_tool_errors_with_all_effects(tmp_path):
     same = truth[:, [names.index(name) for name in plain.problem.free]]
     blind = plain.identify_values(same, values, machines.machines(truth))
     assert rms(blind.found) > 1.15 * rms(outcome.found)
+
+
+@pytest.mark.slow
+def test_eight_hours_with_drift_and_growth(tmp_path):
+    """Drift and temperature both increase with time: their sum is known better than each."""
+    folder = write_plan(tmp_path / "plan", between=timedelta(minutes=8), growing=True)
+    machines = EffectMachines(folder, ("thermal", "drift"))
+    truth = machines.draw(np.random.default_rng(13), MACHINES // 2)
+    check(machines.identify(truth, np.random.default_rng(14)))
 
 
 @pytest.mark.slow
