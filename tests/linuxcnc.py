@@ -27,9 +27,12 @@ import tempfile
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+
+from orthocal.export.linuxcnc import approximation
 
 PROGRAMS = ("linuxcnc", "halcompile", "halcmd", "halsampler", "make", "gcc")
 
@@ -325,6 +328,13 @@ def build_module(folder, *, install=False):
     said = done.stdout + done.stderr
     assert done.returncode == 0, said
     assert "warning" not in said
+
+
+@contextmanager
+def few_nodes(degree=3):
+    """Modules of polynomials up to a lower degree, which are fitted at fewer points."""
+    with patch.dict(approximation.MAX_DEGREE, {3: degree}):
+        yield
 
 
 @contextmanager

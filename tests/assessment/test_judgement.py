@@ -76,12 +76,6 @@ def change(session, row, value):
     return session.with_values(values)
 
 
-def swap(session, one, other):
-    values = session.values.copy()
-    values[[one, other]] = values[[other, one]]
-    return session.with_values(values)
-
-
 def displace(session, setup, by):
     rows = [i for i, r in enumerate(session.readings) if r.setup == setup]
     values = session.values.copy()
@@ -107,13 +101,10 @@ def with_backlash():
 
 VERDICTS = {
     "sound": "enter",
-    "workshop": "enter",
     "experiment 1 as printed": "reject",
     "reversed sign": "review",
-    "decimal point": "review",
     "inches": "review",
     "resolution": "review",
-    "swapped rows": "review",
     "displaced gauge": "review",
     "drift": "review",
     "backlash": "review",
@@ -121,25 +112,19 @@ VERDICTS = {
 }
 """Cases, and the verdict of each."""
 
-CALIBRATED = ("reversed sign", "backlash", "experiment 1 as printed")
-"""Cases that are checked and calibrated."""
-
 
 @pytest.fixture(scope="module")
-def cases(cycles, workshop, table1):
+def cases(cycles, table1):
     """Sound and spoilt sessions by the names of their cases."""
     cycles = cycles.select([r for r in cycles.readings if r.cycle <= 2])
     largest, backlash = int(np.abs(cycles.values).argmax()), with_backlash()
     coarse = replace(cycles.gauge, resolution=10e-3)
     return {
         "sound": cycles,
-        "workshop": workshop,
         "experiment 1 as printed": table1["1-printed"],
         "reversed sign": change(cycles, largest, -cycles.values[largest]),
-        "decimal point": change(cycles, largest, 0.1 * cycles.values[largest]),
         "inches": cycles.with_values(np.round(cycles.values / 25.4, 7)),
         "resolution": cycles.with_gauge(coarse),
-        "swapped rows": swap(cycles, 1, 2),
         "displaced gauge": displace(cycles, "yx", 0.2e-3),
         "drift": drift(cycles, 0.1e-3),
         "backlash": backlash,
@@ -147,9 +132,9 @@ def cases(cycles, workshop, table1):
     }
 
 
-@pytest.mark.parametrize("case", ["workshop", "experiment 1 as printed"])
-def test_every_command_has_the_same_verdict(cases, case, tmp_path):
-    """In the document, as exit code, and by what is exported."""
+@pytest.mark.parametrize("case", ["sound", "experiment 1 as printed"])
+def test_every_command_has_the_same_verdict(cases, case, judged, tmp_path):
+    """In the document, as exit code, and by what is exported. Each judges the readings once."""
     session, expected = cases[case], VERDICTS[case]
     write_session(session, tmp_path / "session")
     code = EXIT_CODES[expected]
@@ -162,6 +147,7 @@ def test_every_command_has_the_same_verdict(cases, case, tmp_path):
         decision = json.loads(done.stdout)["decision"]
         assert (decision["verdict"], decision["exit_code"]) == (expected, code)
         assert done.returncode == code
+    assert len(judged) == 3
     (tmp_path / "calibration.json").write_text(done.stdout)
     words = ["export", "calibration.json", "--to", "yaml", "--out", "out"]
     assert run_orthocal(tmp_path, *words).returncode == code
@@ -170,7 +156,7 @@ def test_every_command_has_the_same_verdict(cases, case, tmp_path):
         assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
 
 
-@pytest.mark.parametrize("case", [c for c in VERDICTS if c not in CALIBRATED])
+@pytest.mark.parametrize("case", [c for c in VERDICTS if c not in ("sound", "reversed sign")])
 def test_a_case_has_its_verdict(cases, case):
     """Findings are of known kinds with numbers of stated units."""
     checked = check_session(cases[case])
@@ -178,22 +164,14 @@ def test_a_case_has_its_verdict(cases, case):
     require_known_findings(checked.to_document()["findings"])
 
 
-@pytest.mark.parametrize(
-    ("case", "model"),
-    [
-        ("reversed sign", "offsets"),
-        ("backlash", "full"),
-        ("experiment 1 as printed", "offsets"),
-    ],
-)
-def test_the_judgement_does_not_depend_on_the_model(cases, case, model, tmp_path):
+def test_the_judgement_does_not_depend_on_the_model(cases, tmp_path):
     """It is that of a check, and is loaded again from a file."""
-    checked = check_session(cases[case])
-    assert checked.decision.verdict == VERDICTS[case]
-    require_known_findings(checked.to_document()["findings"])
-    calibration = calibrate(cases[case], model, **QUICK)
+    session = cases["reversed sign"]
+    checked = check_session(session)
+    assert checked.decision.verdict == "review"
+    calibration = calibrate(session, "offsets", **QUICK)
     assert of_readings(calibration.assessment) == of_readings(checked)
-    assert calibration.assessment.decision.verdict == VERDICTS[case]
+    assert calibration.assessment.decision.verdict == "review"
     require_known_findings(json.loads(result_json(calibration))["findings"])
     loaded = load_calibration(write_calibration(calibration, tmp_path / "calibration.json"))
     assert loaded.assessment.to_document() == calibration.assessment.to_document()
@@ -217,7 +195,7 @@ def require_known_findings(findings):
 
 
 def test_the_readings_of_an_unfinished_session_are_judged(cycles, root, tmp_path):
-    """`check` counts the missing ones; `calibrate` and `compare` refuse and name their lines."""
+    """`check` counts the missing ones; `calibrate` refuses and names their lines."""
     wrong = reverse(cycles, "yx")
     read = [i for i, r in enumerate(wrong.readings) if r.setup in ("yx", "xy") or r.cycle == 1]
     missing = sorted(set(range(len(wrong.readings))) - set(read))
@@ -242,10 +220,9 @@ def test_the_readings_of_an_unfinished_session_are_judged(cycles, root, tmp_path
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stderr) == (0, "")
     assert "4 of 54 readings are missing (lines 5, 7 to 9)." in done.stdout
-    for command in (["calibrate", "."], ["compare", "."]):
-        done = run_orthocal(tmp_path, *command)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert "readings.csv: 4 of 54 readings are missing (lines 5, 7 to 9); " in done.stderr
+    done = run_orthocal(tmp_path, "calibrate", ".")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "readings.csv: 4 of 54 readings are missing (lines 5, 7 to 9); " in done.stderr
     path.write_text("\n".join([lines[0], *(x.rpartition(",")[0] + "," for x in lines[1:])]) + "\n")
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stdout) == (2, "")
@@ -292,30 +269,19 @@ def test_readings_are_judged_once(table1, judged):
     """A stated judgement replaces it, with the same result."""
     session = table1["2"]
     judgement = judge_session(session)
-    stated = calibrate(session, "full", judgement=judgement, **QUICK)
+    stated = calibrate(session, "offsets", judgement=judgement, **QUICK)
     options = SolverOptions(**QUICK)
-    compared = compare_models(session, models=["offsets"], judgement=judgement, options=options)
+    compare_models(session, models=["offsets"], judgement=judgement, options=options)
     assert check_session(session, judgement=judgement).decision.verdict == "enter"
     assert judged == []
-    judged_again = calibrate(session, "full", **QUICK).assessment
+    judged_again = calibrate(session, "offsets", **QUICK).assessment
     assert judged_again.to_document() == stated.assessment.to_document()
     assert judged == [session]
-    again = compare_models(session, models=["offsets"], options=options)
-    assert again.assessment.to_document() == compared.assessment.to_document()
-    assert judged == [session, session]
-
-
-@pytest.mark.parametrize("command", ["check", "calibrate", "compare"])
-def test_a_command_judges_once(root, command, judged):
-    words = [command, "examples/table1/experiment-2"]
-    words += ["--models", "offsets"] if command == "compare" else []
-    assert run_orthocal(root, *words).returncode == 0
-    assert len(judged) == 1
 
 
 NOTES = {
     "model error": lambda c, t: calibrated("table1/experiment-2"),
-    "no redundancy": lambda c, t: calibrated("raw-cycles", "full"),
+    "no redundancy": lambda c, t: calibrated("raw-cycles", "full", **UNJUDGED),
     "noise unknown": lambda c, t: calibrate(
         t["2"].select(t["2"].readings[1:4]).with_gauge(Gauge(None, None, None)), **UNJUDGED
     ),
@@ -325,9 +291,11 @@ NOTES = {
     "compensation not stated, common approach": lambda c, t: calibrate(
         replace(
             c.with_effects(["backlash"]),
-            readings=tuple(replace(r, conditions=Conditions("ppp")) for r in c.readings),
+            readings=tuple(
+                replace(r, conditions=Conditions("ppp")) for r in c.readings if r.cycle == 1
+            ),
         ),
-        solver="variable-projection",
+        **QUICK,
     ),
     "earlier readings": lambda c, t: calibrate(c.with_controller(np.full(3, 1e-3)), **UNJUDGED),
 }
@@ -363,7 +331,7 @@ def test_readings_are_compared_with_the_resolution_of_their_gauge(workshop):
 
 
 def test_the_tool_error_is_that_of_the_accuracy():
-    calibration = calibrated("workshop", "full")
+    calibration = calibrated("workshop", "full", **UNJUDGED)
     tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
     unknown = accuracy.after.sizes.reported.rms
     known = accuracy.measure(accuracy.deviation_with_entries).reported.rms

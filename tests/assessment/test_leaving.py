@@ -37,9 +37,7 @@ def entered():
     parameters = session.robot.parameters
     truth = {n: rng.normal() * parameters[n].prior_std for n in parameters.select_model("full")}
     truth |= {"x_slide.offset": 0.5e-3, "y_slide.offset": -0.7e-3, "z_slide.offset": 0.3e-3}
-    first = calibrate(
-        simulate_session(session, truth, seed=4).session, solver="variable-projection"
-    )
+    first = calibrate(simulate_session(session, truth, seed=4).session, **UNJUDGED)
     again = session.with_controller(offsets_to_enter(first))
     # with the same noise the readings give the same offsets
     second = simulate_session(again, truth, seed=4).session
@@ -107,7 +105,7 @@ def test_sessions_before_and_after_entering_end_with_a_correction(entered):
     first, kept = entered
     assert not first.measured_again
     before, after = restore_session(first), restore_session(kept)
-    joint = calibrate([before, after], solver="variable-projection")
+    joint = calibrate([before, after], **UNJUDGED)
     assert joint.measured_again
     active = tuple(joint.active_offsets.tolist())
     setups = tuple(replace(s, active=active) for s in joint.setups)

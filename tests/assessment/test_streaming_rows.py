@@ -52,15 +52,6 @@ def test_a_pipe_gives_what_a_file_gives(orthocal, tmp_path):
     assert np.abs(again - points).max() < 1e-3
 
 
-def test_rows_out_of_reach_are_named_and_the_others_served(orthocal):
-    text = HEADER + "0,0,0\n" * 5 + "0,0,900\n" + "0,0,0\n" * 3
-    code, out, err = orthocal("inverse", text)
-    assert code == 3
-    assert [i for i, line in enumerate(out.splitlines()) if line == ",,"] == [6]
-    assert err.startswith("orthocal: standard input:7: cannot be reached")
-    assert "1 row cannot be reached; its cells are empty" in err
-
-
 def test_a_wrong_line_of_a_pipe_is_named_and_what_came_before_is_served(orthocal, tmp_path):
     text = HEADER + "0,0,0\n" * 9 + "0,q,0\n"
     code, out, err = orthocal("inverse", text)

@@ -144,22 +144,16 @@ def test_compare_refits_and_files_have_the_same_factor(session, full, offsets, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1.0, 2.83])
-def test_intervals_contain_the_truth_at_any_factor(session, factor):
+def test_intervals_contain_the_truth_of_worse_machines(session):
     """A sample; `tests/benchmarks/worse_machines.py` has more machines, and the full model."""
     count = 8
-    outcome = calibrate_machines(session, "offsets", factor=factor, count=count, profile=[OFFSET])
+    outcome = calibrate_machines(session, "offsets", factor=2.83, count=count, profile=[OFFSET])
     # three offsets of a machine are wrong together
-    judged = outcome.covered if factor == 1.0 else outcome.covered[outcome.found]
+    judged = outcome.covered[outcome.found]
     assert judged.all(axis=1).sum() >= binom.ppf(0.001, len(judged), 0.9)
     assert (outcome.profiled[:, 0] == outcome.covered[:, 0]).all()
     low, high = coverage_band(outcome.mounted.size)
     assert low <= outcome.mounted.sum() <= high
-    if factor == 1.0:
-        assert not outcome.found.any()
-        true, predicted = np.sqrt(np.mean(outcome.tool**2, axis=0))
-        assert true < WITHIN * predicted
-    else:
-        low, high = binom.interval(0.997, count, 0.54)
-        assert low <= outcome.found.sum() <= high
-        assert outcome.ratio < WITHIN
+    low, high = binom.interval(0.997, count, 0.54)
+    assert low <= outcome.found.sum() <= high
+    assert outcome.ratio < WITHIN

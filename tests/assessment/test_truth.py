@@ -34,10 +34,6 @@ MACHINES = 40
 """The sweep leaves a few directions undetermined: the RMS error of 40 machines scatters by 9 %.
 That of 200 machines is 1.03 of the predicted one, with the lines 0.98."""
 
-PREDICTED = {"sweep": 0.062, "lines": 0.008}
-"""RMS tool error over the cube without the common translation, by an independent rigid-body model
-for the 126 errors of joints and offsets, [mm]."""
-
 
 class Machines:
     """A plan with exact gauges, the problem of all errors, and the tool of machines."""
@@ -75,11 +71,6 @@ class Machines:
 @pytest.fixture(scope="module", params=["sweep", "lines"])
 def machines(request):
     return Machines(request.param)
-
-
-def test_the_predicted_tool_error_is_that_of_an_independent_model(machines):
-    predicted = machines.predict_tool_error() * 1e3
-    assert predicted == pytest.approx(PREDICTED[machines.name], rel=0.05, abs=0.0006)
 
 
 @pytest.mark.slow

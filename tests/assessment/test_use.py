@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import run_orthocal
-from conftest import no_sensor_gains
 from effect_plans import write_plan, write_robot
 
 from orthocal import (
@@ -358,9 +357,6 @@ def test_assumed_conditions_are_stated_with_their_cost(folder, calibration):
 
 def test_accuracy_is_under_stated_conditions(folder, calibration):
     stated = ("--approach", "ppp", "--temperature", "25", "--payload", "2")
-    with no_sensor_gains():
-        _, text, _ = run_orthocal(folder, "accuracy", ".", *stated)
-    assert "Conditions: approach ppp, 25 °C and payload 2 kg." in " ".join(text.split())
     _, text, _ = run_orthocal(folder, "accuracy", ".", *stated, "--json")
     document = json.loads(text)
     use = UseConditions("ppp", 25.0, 2.0)
@@ -369,21 +365,6 @@ def test_accuracy_is_under_stated_conditions(folder, calibration):
     assert document["deviation"]["aligned"]["rms"] == pytest.approx(
         expected.measure(expected.deviation).aligned.rms
     )
-
-
-def test_a_stated_condition_does_not_change_the_others(calibration, workspace):
-    """The tool error is between those with constant and with varying conditions."""
-    both, at_25, from_one_side = (
-        assess_tool(calibration, workspace, conditions=c)
-        for c in (None, UseConditions(None, 25.0), UseConditions("ppp", 25.0, 2.0))
-    )
-    assert [set(a.use.varying) for a in (both, at_25, from_one_side)] == [
-        {"approach", "temperature", "payload"},
-        {"approach", "payload"},
-        set(),
-    ]
-    sizes = [a.measure(a.deviation_with_entries).aligned.rms for a in (from_one_side, at_25, both)]
-    assert sizes[0] < sizes[1] < sizes[2]
 
 
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, calibration):

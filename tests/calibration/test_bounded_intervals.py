@@ -61,7 +61,7 @@ def test_a_bound_of_the_user_ends_an_interval():
     assert held.intervals[0][1] < high
 
 
-@pytest.mark.parametrize("sizes", [(8e-6, 0.0, 30e-6), (0.0, 0.0, 0.0), (3e-6, 60e-6, 5e-6)])
+@pytest.mark.parametrize("sizes", [(8e-6, 0.0, 30e-6), (0.0, 0.0, 0.0)])
 def test_intervals_of_backlash_contain_its_posterior(sizes):
     """Draws from the posterior by the normal equations, without negative ones."""
     plan = effect_plan("backlash")

@@ -7,7 +7,7 @@ import io
 import json
 
 import pytest
-from calibrated import calibrated, session_of
+from calibrated import UNJUDGED, calibrated, session_of
 
 from orthocal import (
     Choice,
@@ -107,7 +107,7 @@ def test_a_number_that_follows_from_the_others_may_be_omitted(document, tmp_path
 
 
 def test_tables_are_plain_records():
-    made = calibrated("raw-cycles", "lengths")
+    made = calibrated("raw-cycles", "lengths", **UNJUDGED)
     parameters, readings = parameter_table(made), reading_table(made)
     assert [p["name"] for p in parameters if p["of"] == "machine"] == [
         p.name for p in made.parameters

@@ -20,11 +20,9 @@ from orthocal import (
     load_calibration,
     load_plan,
     load_robot,
-    load_session,
     restore_session,
     simulate_session,
     write_calibration,
-    write_session,
 )
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
@@ -33,7 +31,6 @@ from orthocal.effects.rods import stretch_rod
 from orthocal.errors import OrthocalError, ParameterError, RobotError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.error_map import error_map
@@ -387,16 +384,6 @@ def test_both_solvers_identify_the_same_errors(simulated):
     assert (std[determined] < 0.2).all()
 
 
-def test_a_batch_is_solved_like_single_sets(simulated):
-    problem = build_problem(simulated.session, free=FREE, prior=True)
-    rng = np.random.default_rng(8)
-    values = problem.values + 1e-6 * rng.normal(size=(2, problem.observations.size))
-    batch = BatchSolver(problem).solve(values, sigma=1e-6)
-    for row, theta in zip(values, batch.theta, strict=True):
-        alone = VariableProjection(problem).solve(sigma=1e-6, values=row)
-        assert (np.abs(theta - alone.theta) / problem.theta_scale).max() < 1e-6
-
-
 def test_estimates_of_slack_are_never_negative(plan):
     """Without slack half of the unbounded estimates would be negative."""
     exact_plan = exact(plan)
@@ -428,12 +415,6 @@ def test_joined_sessions_share_the_machine_but_not_the_gauges(simulated):
     problem = build_problem(joined, free=FREE, prior=True)
     assert sum(n.endswith(".creep") for n in problem.free) == 12
     assert sum(n == "rods.growth" for n in problem.free) == 1
-    found = solutions(problem, 0.2e-6)
-    objective = found[0].objective
-    assert found[1].objective == pytest.approx(objective, rel=SAME_OPTIMUM)
-    # in prior std the objective grows at least by half the square of a distance from its minimum
-    off = np.linalg.norm((found[0].theta - found[1].theta) / problem.theta_scale)
-    assert off < np.sqrt(2.0 * SAME_OPTIMUM * objective)
 
 
 def test_readings_without_the_condition_are_refused(tmp_path):
@@ -457,11 +438,3 @@ def test_readings_without_the_condition_are_refused(tmp_path):
     some = replace(session, readings=(stated, *others))
     with pytest.raises(SessionError, match=f"{len(others)} of {len(others) + 1}"):
         identify(some, Choice(free=FREE), **QUICK)
-
-
-def test_a_session_file_keeps_the_conditions(simulated, tmp_path):
-    write_session(simulated.session, tmp_path / "out", decimals=12)
-    again = load_session(tmp_path / "out")
-    one, other = (build_problem(s, free=FREE, prior=True) for s in (simulated.session, again))
-    assert np.abs(one.values - other.values).max() < 1e-12
-    assert np.array_equal(one.states.commands, other.states.commands)

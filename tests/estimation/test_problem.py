@@ -9,7 +9,7 @@ import pytest
 from tolerances import KINEMATICS
 
 from orthocal import load_plan, load_session
-from orthocal.errors import ParameterError, RobotError
+from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.symbolic_problem import SymbolicProblem
 from orthocal.observation.model import predict_readings
@@ -83,16 +83,6 @@ def test_readings_depend_on_few_variables(plan):
         assert piece.theta_index.size == 21
         names = {problem.free[i].split("_")[0] for i in piece.theta_index}
         assert names == {leg}
-
-
-def test_nothing_free_is_refused(plan):
-    with pytest.raises(ParameterError, match="nothing to identify"):
-        build_problem(plan, free=["!*"])
-
-
-def test_an_unknown_model_is_named_with_the_models(plan):
-    with pytest.raises(ParameterError, match="'all' is not a model of this robot; models: offsets"):
-        build_problem(plan, model="all")
 
 
 @pytest.mark.parametrize(

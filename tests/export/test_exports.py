@@ -130,7 +130,7 @@ def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path):
 @pytest.fixture(scope="module")
 def disordered(root):
     """Calibration of two sessions, the one with active offsets given first."""
-    plan = load_session(root / "examples/workshop")
+    plan = load_session(root / "examples/raw-cycles")
     truth = {f"{d.name}.offset": 1e-3 for d in plan.robot.drives}
     sessions = [
         simulate_session(plan.with_controller([v] * 3), truth, seed=k).session
@@ -141,22 +141,20 @@ def disordered(root):
     return calibration
 
 
-@pytest.mark.parametrize("command", ["export", "again", "correct"])
-def test_sessions_in_another_order_are_noted_with_the_values(disordered, root, tmp_path, command):
+def test_sessions_in_another_order_are_noted_with_the_values(disordered, root, tmp_path):
     """Their present offsets may be others, so that the written ones would count twice."""
     file = write_calibration(disordered, tmp_path / "calibration.json")
     (tmp_path / "part.ngc").write_text(PROGRAM)
-    words = {
-        "export": ["--to", "linuxcnc", "--offsets"],
-        "again": ["--session", str(root / "examples/workshop")],
-        "correct": ["part.ngc"],
-    }
-    done = run_orthocal(tmp_path, command, str(file), *words[command], "--out", "out")
-    assert done.returncode == 0, done.stderr
     (found,) = disordered.assessment.of_kind("wrong order")
-    assert found.words in done.stderr
-    if command == "export":
-        assert found.words in (tmp_path / "out/README.md").read_text()
+    for command, *words in (
+        ("export", "--to", "linuxcnc", "--offsets"),
+        ("again", "--session", str(root / "examples/raw-cycles")),
+        ("correct", "part.ngc"),
+    ):
+        done = run_orthocal(tmp_path, command, str(file), *words, "--out", f"{command}.out")
+        assert done.returncode == 0, done.stderr
+        assert found.words in done.stderr
+    assert found.words in (tmp_path / "export.out/README.md").read_text()
 
 
 def test_a_refusal_states_every_finding_with_its_action(turned):

@@ -13,7 +13,7 @@ import pytest
 from calibrated import SOUND
 from effect_plans import write_plan, write_robot
 from independent import Expansion, IndependentMachine, States
-from linuxcnc import require_linuxcnc, run_programs
+from linuxcnc import few_nodes, require_linuxcnc, run_programs
 from loaded_orthoglide import settle
 from test_linuxcnc import SWITCH, Core, homes_of, joints_at_switch, joints_of, machine_of
 
@@ -40,6 +40,9 @@ JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}
 WITHIN = 0.1e-6
 """Tolerance of the modules, [m]."""
 
+SMALL = 0.03
+"""Half the side of a region that a polynomial of a lower degree suffices for, [m]."""
+
 CLOSED = 1e-11
 """Error of the independent machine's loops, [m]."""
 
@@ -57,8 +60,8 @@ TEMPERATURES = (7.0, 13.1, 22.0, 28.7, 37.0)
 """The module covers 15 K to both sides of the reference."""
 
 
-def points_in_region(count, seed):
-    return np.random.default_rng(seed).uniform(-0.06, 0.06, (count, 3))
+def points_in_region(count, seed, *, half_side=0.06):
+    return np.random.default_rng(seed).uniform(-half_side, half_side, (count, 3))
 
 
 def drives_of(robot, joints):
@@ -75,10 +78,17 @@ class ThermalCore(Core):
         return self
 
 
-def build(tmp_path, known, *, periodic=False, within=WITHIN, **options):
-    approximation = approximate(known, within=within, half_side=0.06, **options)
+def build(tmp_path, known, *, periodic=False, within=WITHIN, half_side=0.06, **options):
+    with few_nodes(degree=4 if half_side == SMALL else 6):
+        approximation = approximate(known, within=within, half_side=half_side, **options)
     files = write_core(known, approximation, homes_of(known))
     return approximation, ThermalCore(tmp_path, files, periodic=periodic)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cheap_modules():
+    with few_nodes(degree=6):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -110,10 +120,10 @@ def test_core_reaches_points_on_an_independent_machine(tmp_path):
     folder = write_robot(tmp_path / "machine", f"{THERMAL}, screw: {{lead_mm: 5}}", joints=JOINTS)
     errors = TRUTH | SCREWS
     known = machine_of(load_robot(folder), errors)
-    approximation, core = build(tmp_path, known, periodic=True)
+    approximation, core = build(tmp_path, known, periodic=True, half_side=SMALL)
     expansion = Expansion(legs=11.5e-6, screws=9e-6, reference=22.0)
     machine = IndependentMachine(folder, errors, lead=5 * MM, expansion=expansion)
-    points = points_in_region(60, seed=3)
+    points = points_in_region(60, seed=3, half_side=SMALL)
     for t in TEMPERATURES:
         drives = drives_of(known.robot, core.at(t).inverse(points / MM))
         states = States(drives, np.zeros_like(drives), np.full(len(drives), t))
@@ -144,7 +154,7 @@ def test_range_of_use_widens_that_of_the_module(tmp_path):
         text.replace("\n  tcp: ", "\n  use: {temperature_C: [10, 45]}\n  tcp: ")
     )
     change = approximate(
-        machine_of(load_robot(folder), {}), within=1e-6, half_side=0.05
+        machine_of(load_robot(folder), {}), within=1e-6, half_side=SMALL
     ).inverse.thermal
     assert (change.lowest, change.highest) == (7.0, 45.0)
 
@@ -156,10 +166,10 @@ def test_module_corrects_the_deflection_by_a_payload(tmp_path, monkeypatch):
     """At rest the energy of springs and weight is least. Few checks state a smaller error."""
     monkeypatch.setattr(approximating, "check_points", partial(check_points, count=50))
     known = machine_of(load_robot(write_robot(tmp_path / "m", SOFT)), {})
-    approximation, core = build(tmp_path, known, payload=3.0, within=1e-6)
+    approximation, core = build(tmp_path, known, payload=3.0, within=1e-6, half_side=SMALL)
     assert approximation.payload == 3.0
     weight = np.array([0.0, 0.0, -(5.0 + 3.0) * GRAVITY])
-    points = points_in_region(1, seed=5)
+    points = points_in_region(1, seed=5, half_side=SMALL)
     for point, drives in zip(
         points, drives_of(known.robot, core.inverse(points / MM)), strict=True
     ):
@@ -190,7 +200,7 @@ def test_page_states_temperature_and_payload(thermal):
 
 def test_module_without_thermal_expansion_has_no_pin(tmp_path):
     known = machine_of(load_robot("orthoglide"), {})
-    approximation = approximate(known, within=1e-6, half_side=0.06)
+    approximation = approximate(known, within=1e-6, half_side=SMALL)
     files = write_core(known, approximation, homes_of(known))
     assert "#define ORTHOCAL_THERMAL 0\n" in files["orthocal_core.h"]
     assert approximation.unheated is approximation.payload is approximation.heavier is None
@@ -203,7 +213,7 @@ def test_module_without_thermal_expansion_has_no_pin(tmp_path):
 def test_bad_payloads_are_refused(tmp_path, payload):
     known = machine_of(load_robot(write_robot(tmp_path / "m", SOFT)), {})
     with pytest.raises(ParameterError) as caught:
-        approximate(known, within=1e-6, half_side=0.06, payload=payload)
+        approximate(known, within=1e-6, half_side=SMALL, payload=payload)
     assert caught.value.where == "--payload"
 
 

@@ -79,10 +79,9 @@ def promised(page):
 
 
 @pytest.mark.usefixtures("short_reports")
-@pytest.mark.parametrize("firmware", ["klipper", "marlin", "reprapfirmware"])
-def test_walk_of_the_owner_of_a_printer(tmp_path, firmware):
+def test_walk_of_the_owner_of_a_printer(tmp_path):
     """Paste a log, get an answer and lines; enter them; the bed is flat as promised."""
-    rng = np.random.default_rng(1)
+    rng, firmware = np.random.default_rng(1), "reprapfirmware"
     printer, settings = make_printer(tmp_path, 4), nominal()
     (tmp_path / "log.txt").write_text(probe_log(firmware, printer, settings, rng))
     for command in (
@@ -155,6 +154,17 @@ def test_no_nearby_settings_are_better(calibrated):
                 assert cost(replace(s, **{name: tuple(values)}))[0] > best
     assert cost(replace(s, radius=s.radius + 0.05 * MM))[0] > best
     assert cost(replace(s, radius=s.radius - 0.05 * MM))[0] > best
+
+
+@pytest.mark.parametrize("firmware", ["klipper", "marlin", "reprapfirmware"])
+def test_the_bed_is_flat_with_the_lines_of_each_firmware(calibrated, firmware):
+    """As the printer of the session reads them."""
+    printer, calibration = calibrated
+    fit = fit_firmware(calibration, firmware)
+    lines = FIRMWARES[firmware].config_lines(fit.settings)
+    flat = printer.probe(read_settings(firmware, lines, -TRIGGER_MM), rings()) - TRIGGER_MM
+    expected = np.hypot(fit.new.layer_rms, fit.layer_uncertainty) / MM
+    assert np.sqrt(np.mean(flat**2)) < PROMISE * expected
 
 
 def test_one_length_for_all_rods(calibrated):
@@ -291,13 +301,12 @@ def test_uncertainty_of_the_settings(calibrated):
     assert (stated >= 0.99 * spread / sizes).all()
     assert (stated < 1.3 * spread / sizes + 1e-12).all()  # Student's factor
     rng = np.random.default_rng(3)
-    for _ in range(2):
-        errors = SHARE * rng.multivariate_normal(np.zeros(len(covariance)), covariance)
-        ends = [fit_firmware(_displaced(calibration, s * errors), "klipper") for s in (1.0, -1.0)]
-        new = np.array([[r.new for r in end.rows] for end in ends]) * sizes
-        change = 0.5 * (new[0] - new[1])
-        missed = np.abs(change - fit.gain @ errors)
-        assert (missed <= SECOND_ORDER * SHARE * spread + 1e-9).all()
+    errors = SHARE * rng.multivariate_normal(np.zeros(len(covariance)), covariance)
+    ends = [fit_firmware(_displaced(calibration, s * errors), "klipper") for s in (1.0, -1.0)]
+    new = np.array([[r.new for r in end.rows] for end in ends]) * sizes
+    change = 0.5 * (new[0] - new[1])
+    missed = np.abs(change - fit.gain @ errors)
+    assert (missed <= SECOND_ORDER * SHARE * spread + 1e-9).all()
 
 
 def _displaced(calibration, errors):

@@ -38,9 +38,7 @@ def with_bar(root, folder, example, planes):
     ("example", "planes", "seed", "tolerances"),
     [
         ("inclined_orthoglide", CIRCLES, 14, {"*.offset_mm": 4.0}),
-        ("inclined_orthoglide", CIRCLES, 26, {"*.offset_mm": 4.0}),
-        ("inclined_orthoglide", CIRCLES, 44, {"*.offset_mm": 4.0}),
-        *(("raw-cycles", ["xy"], seed, None) for seed in (0, 21, 24, 54)),
+        ("raw-cycles", ["xy"], 0, None),
     ],
 )
 def test_a_known_bar_on_a_machine_with_large_offsets_is_not_accused(
@@ -57,7 +55,7 @@ def test_a_known_bar_on_a_machine_with_large_offsets_is_not_accused(
 
 @pytest.mark.parametrize(
     ("axis", "off_mm", "verdict"),
-    [("x", 3.0, "enter"), ("x", 10.0, "reject"), ("y", -15.0, "reject")],
+    [("x", 3.0, "enter"), ("y", -15.0, "reject")],
 )
 def test_a_misplaced_ball_is_named(root, tmp_path, axis, off_mm, verdict):
     """Near its tolerance of 2 mm the fit follows it; far beyond, it is the only large error."""

@@ -15,7 +15,6 @@ from orthocal import draw_errors, load_plan, simulate_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.linear_model import CONVERGED_CHANGE, MAX_STEPS, LinearModel
-from orthocal.hypotheses.search import find_anomalies
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.session.session import Reading
 from orthocal.units import MM
@@ -187,18 +186,7 @@ def test_readings_scatter_about_their_predictions_as_stated():
     assert abs(np.mean(scores)) < 0.3
 
 
-def test_the_expected_value_of_an_outlier_is_its_prediction(raw_cycles):
-    values = raw_cycles.values.copy()
-    values[9] += 0.13 * MM
-    wrong = raw_cycles.with_values(values)
-    (anomaly,) = find_anomalies(wrong).found
-    mean, _ = LinearModel(wrong).predict_row(values, 9)
-    assert (anomaly.explanation.kind, anomaly.explanation.rows) == ("outlier", (9,))
-    assert anomaly.expected == pytest.approx(mean, abs=1e-9)
-
-
-@pytest.mark.parametrize("offset", [4.3e-3, 4.5e-3, 4.7e-3])
-def test_a_correct_reading_near_the_edge_of_a_rod_is_not_contradicted(tmp_path, offset):
+def test_a_correct_reading_near_the_edge_of_a_rod_is_not_contradicted(tmp_path):
     """The first step to the most likely machine is to one whose rod the tip misses.
 
     The nominal machine predicts the reading to 0.1 mm, although it is wrong by more than 1 mm.
@@ -206,7 +194,7 @@ def test_a_correct_reading_near_the_edge_of_a_rod_is_not_contradicted(tmp_path, 
     keys = plans.paper() | yaml.safe_load(NEAR_THE_EDGE)
     (tmp_path / "session.yaml").write_text(yaml.safe_dump(keys, sort_keys=False))
     plan = load_plan(tmp_path)
-    session = simulate_session(plan, {"y_slide.offset": offset}, seed=1).session
+    session = simulate_session(plan, {"y_slide.offset": 4.3e-3}, seed=1).session
     row = [(r.setup, r.posture) for r in session.readings].index(("xz", "z_min"))
     mean, std = LinearModel(session).compare_row(session.values, row)
     assert abs(session.values[row] - mean) < 2.0 * std

@@ -191,7 +191,7 @@ def test_a_large_difference_is_refused(session):
 
 def test_a_chain_of_differences_is_followed_promptly(session):
     """Each difference refers to the one before it."""
-    count = 3000
+    count = 1500
     postures = "".join(f"  p{i}: {{tcp_mm: [{i * 0.01:.2f}, 0, 0]}}\n" for i in range(count))
     swap(session / "session.yaml", "postures:\n", f"postures:\n{postures}")
     rows = "".join(f"yx,p{i},p{i - 1},1,0.001\n" for i in range(count - 1, 0, -1))

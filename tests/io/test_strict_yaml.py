@@ -77,11 +77,11 @@ def test_mutated_documents(load):
         (f"a: {'[' * 21}{']' * 21}", "nested more than 20 deep"),
         # the scanner of libyaml may stop before the events do
         *((f"a: {'[' * n}{']' * n}", "nest") for n in (5000, 100_000)),
-        ("title: [" + "1," * 250_000 + "]", "holds more than 50000 keys and values"),
+        ("title: [" + "1," * 60_000 + "]", "holds more than 50000 keys and values"),
         *(
             (f"a: {form.format('9' * digits)}", "does not fit its tag !!")
             for form in ("{}", "-{}", "0x{}", "{}.5")
-            for digits in (101, 4301, 100_000)
+            for digits in (101, 4301)
         ),
         *(
             (f"title: {value}", "could not determine a constructor for the tag")

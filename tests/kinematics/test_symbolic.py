@@ -87,13 +87,12 @@ def some_frames(model):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.15, 0.5, 2.5])
-def test_poses_equal_pinocchios(all_models, name, size):
+def test_poses_equal_pinocchios(all_models, name):
     model = all_models[name]
     joints, frames = list(model.names)[1:], some_frames(model)
     function = build(model, joints, frames)
     rng = np.random.default_rng(7)
-    for _ in range(5):
+    for size in (0.0, 1e-9, 1e-3, 0.15, 0.5, 2.5) * 3:
         v = rng.uniform(-3.0, 3.0, model.nv)
         dj = size * rng.uniform(-1.0, 1.0, (6, len(joints)))
         df = size * rng.uniform(-1.0, 1.0, (6, len(frames)))
@@ -103,8 +102,7 @@ def test_poses_equal_pinocchios(all_models, name, size):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("size", [0.0, 0.2])
-def test_derivatives_by_coordinates_and_errors_are_exact(all_models, name, size):
+def test_derivatives_by_coordinates_and_errors_are_exact(all_models, name):
     model = all_models[name]
     joints, frames = list(model.names)[1:], some_frames(model)
     function = build(model, joints, frames)
@@ -114,10 +112,11 @@ def test_derivatives_by_coordinates_and_errors_are_exact(all_models, name, size)
     y = function(split[0], ca.reshape(split[1], 6, -1), ca.reshape(split[2], 6, -1))
     value, slope = ca.Function("y", [x], [y]), ca.Function("dy", [x], [ca.jacobian(y, x)])
     rng = np.random.default_rng(11)
-    at = np.r_[rng.uniform(-2, 2, n), size * rng.uniform(-1, 1, x.numel() - n)]
-    assert_derivative(
-        np.asarray(slope(at).full()), lambda u: np.asarray(value(u)).ravel(), at, step=1e-5
-    )
+    for size in (0.0, 0.2):
+        at = np.r_[rng.uniform(-2, 2, n), size * rng.uniform(-1, 1, x.numel() - n)]
+        assert_derivative(
+            np.asarray(slope(at).full()), lambda u: np.asarray(value(u)).ravel(), at, step=1e-5
+        )
 
 
 def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):

@@ -103,7 +103,7 @@ def one(tmp_path_factory):
     truth = {f"{d}_slide.backlash": 30e-6 for d in "xyz"}
     session = simulate_session(plan.with_controller(np.zeros(3)), truth, seed=1).session
     (folder / "one").mkdir()
-    result = calibrate(session, **UNJUDGED)
+    result = calibrate(session, "offsets", **UNJUDGED)
     write_calibration(result, folder / "one" / "calibration.json")
     return folder / "one"
 

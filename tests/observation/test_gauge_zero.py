@@ -22,7 +22,7 @@ from orthocal.measurement.files.write_session import write_session
 SIGMA = 5e-6
 
 
-@pytest.fixture(params=[(), ("yx",), None], ids=["free", "one known", "all known"])
+@pytest.fixture(params=[("yx",), None], ids=["one known", "all known"])
 def session(request, exact_plan):
     plan = exact_plan
     known = plan.setups if request.param is None else request.param

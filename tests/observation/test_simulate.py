@@ -119,7 +119,7 @@ def test_drawn_errors_share_no_numbers_with_noise_and_sensors(plan):
     names = list(draw_errors(plan.robot, ["*"], seed=0))
     problem = build_problem(fine, free=names, prior=True)
     drawn, sensors, shown = [], [], []
-    for seed in range(300):
+    for seed in range(100):
         errors = draw_errors(plan.robot, ["*"], seed=seed)
         simulated = simulate_session(fine, errors, seed=seed)
         zeros = [simulated.zeros[r.setup] for r in plan.readings]

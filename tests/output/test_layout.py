@@ -19,19 +19,18 @@ NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
 
 @pytest.fixture(scope="module")
 def results(root, experiment_2):
-    calibration = calibrated(EXPERIMENT_2, "full")
+    calibration = calibrated(EXPERIMENT_2)
     afterwards = load_session(root / "examples/table1/experiment-3")
     unstated = replace(afterwards, controller_offsets=None)
     return {
-        "offsets": calibrated(EXPERIMENT_2),
-        "full": calibration,
+        "offsets": calibration,
         "validation": validate_calibration(calibration, unstated),
         "comparison": compare_models(experiment_2, models=["offsets", "lengths"], options=FAST),
     }
 
 
 @pytest.mark.parametrize("details", [True, False], ids=["details", "answer"])
-@pytest.mark.parametrize("name", ["offsets", "full", "validation", "comparison"])
+@pytest.mark.parametrize("name", ["offsets", "validation", "comparison"])
 def test_no_number_is_cut_however_narrow_it_gets(name, details, results):
     content = render_result(results[name], details=details, all_rows=details)
     numbers = set(NUMBER.findall(to_text(content, width=400)))

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from calibrated import EXPERIMENT_2, calibrated
+from calibrated import EXPERIMENT_2, UNJUDGED, calibrated
 
 from orthocal import calibrate, draw_errors, simulate_session, summarize
 from orthocal.assessment.fit_findings import describe_gauge
-
-QUICK = {"solver": "variable-projection"}
 
 pytestmark = pytest.mark.usefixtures("without_sensor_gains")
 
@@ -72,26 +70,26 @@ def every_time(session):
     """A machine with errors of three times their tolerances; only offsets are identified."""
     errors = draw_errors(session.robot, ["*.rx", "*.ry", "*.rz", "*.length"], seed=1)
     larger = {name: 3.0 * value for name, value in errors.items()}
-    return calibrate(simulate_session(session, larger, seed=1).session, "offsets", **QUICK)
+    return calibrate(simulate_session(session, larger, seed=1).session, "offsets", **UNJUDGED)
 
 
 def once(session):
     rows = tuple(r for r in session.readings if r.cycle == 1)
-    return calibrate(_silent(replace(session, readings=rows)), **QUICK)
+    return calibrate(_silent(replace(session, readings=rows)), **UNJUDGED)
 
 
 def three_rows(session):
-    return calibrate(_silent(replace(session, readings=session.readings[1:4])), **QUICK)
+    return calibrate(_silent(replace(session, readings=session.readings[1:4])), **UNJUDGED)
 
 
 def three_stated_rows(session):
-    return calibrate(replace(session, readings=session.readings[1:4]), **QUICK)
+    return calibrate(replace(session, readings=session.readings[1:4]), **UNJUDGED)
 
 
 EXPLAINED = {
-    "fits": (lambda c, e: calibrate(_silent(c), **QUICK), {"sigma_mm": 0.0102}),
+    "fits": (lambda c, e: calibrate(_silent(c), **UNJUDGED), {"sigma_mm": 0.0102}),
     "gauge overstated": (
-        lambda c, e: calibrate(c.with_gauge(replace(c.gauge, sigma=5e-5)), "full", **QUICK),
+        lambda c, e: calibrate(c.with_gauge(replace(c.gauge, sigma=5e-5)), "full", **UNJUDGED),
         {"ratio": 0.195, "gauge_sigma_mm": 0.05},
     ),
     "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),

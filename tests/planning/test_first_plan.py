@@ -45,9 +45,6 @@ def test_the_first_plan_of_the_orthoglide_is_the_paper_plan(orthoglide, root):
 @pytest.mark.parametrize(
     "sizes",
     [
-        Orthoglide(
-            leg=0.25, travel=(0.1, 0.32), attachment=0.03, rods_apart=0.06, rod_radius=0.004
-        ),
         Orthoglide(leg=0.15, travel=(0.06, 0.24), attachment=0.02),
         Orthoglide(leg=0.6, travel=(0.3, 0.9)),
     ],

@@ -54,7 +54,7 @@ def gain_of(kind, setup, information, root):
     return kind.of(setup, covariance, covariance @ root, SIGMA)
 
 
-@pytest.fixture(params=range(6))
+@pytest.fixture(params=range(4))
 def drawn(request):
     setup, information, root = draw(request.param)
     gain = gain_of(SetupGain, setup, information, root)
@@ -177,7 +177,7 @@ def align(setup, first):
     return replace(setup, jacobian=setup.jacobian + change, aligned=())
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
     """Low-rank changes give the numbers of a setup that was aligned before."""
     setup, information, root = draw(seed)
@@ -221,7 +221,7 @@ def draw_points(seed):
     return setup, *draw_others(rng)
 
 
-@pytest.fixture(params=range(4))
+@pytest.fixture(params=range(2))
 def drawn_points(request):
     setup, information, root = draw_points(request.param)
 
@@ -260,22 +260,3 @@ def test_points_are_completed_greedily_from_the_best_one(drawn_points):
     gains, chosen = gain.grow(pair, 4)
     assert list(chosen) == expected
     assert gains == pytest.approx([reduction(chosen[: k + 1]) for k in range(4)], rel=1e-9)
-
-
-def test_points_of_one_number_are_readings():
-    """A block of width 1 with a known gauge zero has the gain of `SetupGain`."""
-    setup, information, root = draw_points(0)
-    single = replace(
-        setup,
-        rows=np.arange(POINTS),
-        jacobian=setup.jacobian[::WIDTH],
-        width=1,
-        covariance=setup.covariance[::WIDTH, ::WIDTH],
-        absolute=True,
-    )
-    both = [gain_of(kind, single, information, root) for kind in (PointGain, SetupGain)]
-    one, other = (gain.exchange_gains([4, 0, 2]) for gain in both)
-    np.testing.assert_allclose(one, other, rtol=1e-9)
-    one, other = (gain.grow((1, 3), 5) for gain in both)
-    assert one[1] == other[1]
-    assert one[0] == pytest.approx(other[0], rel=1e-9)

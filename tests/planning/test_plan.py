@@ -38,7 +38,7 @@ from orthocal.output.text.plan import OUT_OF_RANGE, plan_json
 from orthocal.planning import plan as planning
 from orthocal.planning.candidates import list_candidates, measure_candidates, share_columns
 from orthocal.planning.cost_curve import compute_curve, find_enough
-from orthocal.planning.equipment import Equipment, choose_box, find_box
+from orthocal.planning.equipment import Equipment, choose_box
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import Duration
 from orthocal.planning.plan import plan_readings
@@ -60,20 +60,13 @@ def planned(orthoglide):
     return plan_readings(orthoglide, choice, equipment=Equipment(**QUICK), starts=1)
 
 
-@pytest.mark.parametrize(
-    ("tip", "setups", "each", "most"),
-    [(BALL, 6, 3, 11.4), (None, 6, 16, 9.0)],
-)
-def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
-    """Best manual plans for 126 errors, a dial of ±5 mm and 5 µm with mounting errors, [µm].
-
-    Without a tip the dial reads the line between the rods.
-    """
+def test_a_plan_is_better_than_manual_ones(orthoglide):
+    """The best manual plan for 126 errors, a dial of ±5 mm and 5 µm with mounting errors."""
     choice = Choice(free=JOINTS, prior=True, tolerances=OFFSETS)
     sections = (0.2, 0.8)
     box = np.array([[-0.1, 0.06]] * 3)
     equipment = Equipment(
-        gauge=DIAL, tip=tip, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=5
+        gauge=DIAL, tip=BALL, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=5
     )
     forecast = ToolForecast(
         orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
@@ -82,8 +75,8 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     n = len(candidates.state)
     search = SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
-    plan = search.choose([each] * setups, starts=1)
-    assert round(plan.error * 1e6, 1) <= most
+    plan = search.choose([3] * 6, starts=1)
+    assert round(plan.error * 1e6, 1) <= 11.4
 
 
 def test_the_error_of_the_search_is_the_posterior_of_the_session(planned):
@@ -164,7 +157,6 @@ def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
     assert plan.forecast.workspace.half_side == pytest.approx(0.08)
     small = ToolForecast(robot, plan.forecast.selection, cube(robot, half_side=0.06))
     assert plan.expected.reported.rms > 1.2 * small.after(plan.session).reported.rms
-    assert_machines_have_the_expected_error(plan, machines=12)
 
 
 def test_readings_of_machines_at_tolerance_stay_in_the_gauges_range(planned):
@@ -251,15 +243,11 @@ def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
     a margin."""
     within = np.array([[-0.12, 0.07], [-0.12, 0.07], [0.0, 0.06]])
     assert np.array_equal(choose_box(orthoglide, within), within)
-    assert np.array_equal(choose_box(orthoglide, None), find_box(orthoglide))
+    assert choose_box(orthoglide, None) == pytest.approx(np.array([[-0.1, 0.07]] * 3))
     large = choose_box(orthoglide, np.array([[-0.5, 0.5], [-0.5, 0.02], [-9.0, 9.0]]))
     assert large == pytest.approx(np.array([[-0.18, 0.07], [-0.18, 0.02], [-0.18, 0.07]]))
     beside = np.array([[0.3, 0.5]] * 3)
     assert np.array_equal(choose_box(orthoglide, beside), beside)
-
-
-def test_the_default_box_is_the_reach_of_the_tool(orthoglide):
-    assert find_box(orthoglide) == pytest.approx(np.array([[-0.1, 0.07]] * 3))
 
 
 def test_a_plan_uses_the_available_hours(orthoglide):

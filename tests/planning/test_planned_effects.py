@@ -269,6 +269,7 @@ def test_arrows_show_the_direction_of_joint_coordinates(orthoglide):
 def test_the_command_plans_for_effects(tmp_path):
     quick = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
     words = ["plan", "orthoglide", *quick, "--effects", "backlash,thermal", "--out", "monday"]
+    words[2:2] = ["--model", "offsets"]
     with uncompared():
         code, text, _ = run_orthocal(tmp_path, *words, "--temperature", "20:28")
     assert code == 0

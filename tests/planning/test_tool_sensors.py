@@ -106,8 +106,11 @@ def planned(owned):
 
 
 def test_every_candidate_posture_touches_its_artefact(owned, orthoglide):
-    sensors = owned(bar=BAR, square=SQUARE, plate=PLATE, block=BLOCK)
-    gauges, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
+    """The zero of the bar is free, as its file states."""
+    sensors = owned(bar=BAR + "zero: free\n", square=SQUARE, plate=PLATE, block=BLOCK)
+    with few_balls(2):
+        gauges, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
+    assert {s.zero for s in setups.values() if s.gauge == "bar"} == {"free"}
     assert set(gauges) == {"bar", "square", "plate", "block"}
     assert {s.gauge for s in setups.values()} == set(gauges)
     for name, setup in setups.items():
@@ -459,11 +462,6 @@ def test_gauges_of_one_name_are_refused(owned, orthoglide, names):
     assert str(caught.value.where).endswith(f"{names[0]}.yaml")
 
 
-def test_a_file_can_state_a_free_zero(owned, orthoglide):
-    _, _, setups, _ = list_tool_candidates(orthoglide, owned(bar=BAR + "zero: free\n"), None)
-    assert {s.zero for s in setups.values()} == {"free"}
-
-
 def without_legs():
     """Orthoglide whose legs cannot be read, so that plans contain points alone."""
     return replace(entered("orthoglide"), legs={})
@@ -636,7 +634,7 @@ def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
 def planar(owned):
     """Plan of an hour with a ball bar for a machine whose tool moves in a plane."""
     equipment = Equipment(owned=owned(bar=BAR), **QUICK)
-    with uncompared():
+    with few_balls(4), uncompared():  # a plane has two of them
         return plan_readings(entered("biglide"), hours=1.0, equipment=equipment, starts=1)
 
 
@@ -681,35 +679,22 @@ def test_programs_of_a_planar_bar_move_along_its_circle(planar, depth):
         assert steps.max() < 5.0
 
 
-def test_calibrated_planar_machines_have_the_expected_error_of_a_bar(owned):
-    """Two fixed balls lie off the plane of motion by 1 mm (standard deviation)."""
-    equipment = Equipment(owned=owned(bar=BAR), **QUICK)
-    with few_balls(4), uncompared():  # a plane has two of them
-        plan = plan_readings(entered("biglide"), hours=1.0, equipment=equipment, starts=1)
-    assert len(bars_of(plan.session)) == 2
-    assert plan.expected.reported.rms < 4.5e-6
-    assert_machines_have_the_expected_error(plan, count=12)
-
-
 def simulate_planar(planar, seed):
     errors = draw_errors(planar.session.robot, planar.forecast.names, seed=seed)
     return simulate_session(planar.session, errors, seed=seed).session
 
 
-@pytest.fixture(scope="module")
-def sparse(owned):
-    """`planar` with fewer candidate readings."""
-    equipment = Equipment(owned=owned(bar=BAR), **{**QUICK, "along": 4})
-    with uncompared():
-        return plan_readings(entered("biglide"), hours=1.0, equipment=equipment, starts=1)
+def test_calibrated_planar_machines_have_the_expected_error_of_a_bar(planar):
+    """Two fixed balls lie off the plane of motion by 1 mm (standard deviation)."""
+    assert len(bars_of(planar.session)) == 2
+    assert planar.expected.reported.rms < 4.5e-6
+    assert_machines_have_the_expected_error(planar, count=12)
 
 
-@pytest.mark.parametrize(("plan", "seed"), [("planar", 8), ("planar", 18), ("sparse", 8)])
-def test_both_solvers_agree_where_balls_are_off_the_plane(request, plan, seed):
+def test_both_solvers_agree_where_balls_are_off_the_plane(planar):
     """Heights change readings to second order only. Both of their signs are local optima."""
-    plan = request.getfixturevalue(plan)
-    session = simulate_planar(plan, seed)
-    problem = plan.forecast.problem(session)
+    session = simulate_planar(planar, 8)
+    problem = planar.forecast.problem(session)
     drives = [problem.free.index(f"{d.name}.offset") for d in session.robot.drives]
     one, other = (
         program(problem).solve(sigma=stated_sigma(session.gauge))
@@ -719,23 +704,20 @@ def test_both_solvers_agree_where_balls_are_off_the_plane(request, plan, seed):
     assert one.theta[drives] == pytest.approx(other.theta[drives], abs=SAME_OPTIMUM)
 
 
-@pytest.mark.parametrize("text", [SQUARE, PLATE, PROBE])
-def test_sensors_that_need_three_coordinates_are_refused_on_a_planar_machine(owned, text):
-    with pytest.raises(ParameterError) as caught:
-        list_tool_candidates(load_robot("biglide"), owned(sensor=text), None)
-    assert str(caught.value.where).endswith("sensor.yaml")
+def test_fixed_balls_off_the_plane_are_no_mistakes(planar):
+    """Their heights, of up to 3.9 mm, have the effect of another bar length to first order."""
+    findings = judge_session(simulate_planar(planar, 18)).findings
+    assert {f.severity for f in findings} <= {"note"}
 
 
-def test_points_on_a_planar_machine_lie_in_its_plane(owned):
+def test_sensors_on_a_planar_machine(owned):
+    """Those that need three coordinates are refused; points lie in its plane."""
     robot = load_robot("biglide")
+    for text in (SQUARE, PLATE, PROBE):
+        with pytest.raises(ParameterError) as caught:
+            list_tool_candidates(robot, owned(sensor=text), None)
+        assert str(caught.value.where).endswith("sensor.yaml")
     _, postures, setups, _ = list_tool_candidates(robot, owned(track=TRACKER), None)
     assert list(setups) == ["track[x]", "track[y]", "track[z]"]
     assert {len(p.values) for p in postures.values()} == {2}
     assert len(postures) == 25
-
-
-@pytest.mark.parametrize("seed", [0, 18])
-def test_fixed_balls_off_the_plane_are_no_mistakes(planar, seed):
-    """Their heights, of up to 3.9 mm, have the effect of another bar length to first order."""
-    findings = judge_session(simulate_planar(planar, seed)).findings
-    assert {f.severity for f in findings} <= {"note"}

@@ -176,6 +176,9 @@ def test_derivatives(session):
 
 
 def test_solvers_find_one_optimum(session):
+    """Of the distances and a quarter of the heights."""
+    few = session.readings[:-12:4] + session.readings[-12:]
+    session = replace(session, readings=few)
     found = [
         identify(session, solver=SolverOptions(solver=solver, hessian=hessian))[0]
         for solver, hessian in (("variable-projection", "gauss-newton"), ("ipopt", "exact"))
@@ -244,9 +247,9 @@ def test_the_first_outer_distance_of_5567_is_the_likeliest_mistake(printer):
     readings, first = session.readings, len(session.readings) - 12
     verdicts = [
         check_session(replace(session, readings=readings[:row] + readings[row + 1 :]))
-        for row in range(first + 5, first + 8)
+        for row in (first + 6, first + 7)
     ]
-    assert [v.decision.verdict == "enter" for v in verdicts] == [False, True, False]
+    assert [v.decision.verdict == "enter" for v in verdicts] == [True, False]
 
 
 def test_distances_typed_as_widths_are_named(printer):
@@ -265,18 +268,16 @@ def test_distances_typed_as_widths_are_named(printer):
     assert named == {f"outer_{k}_far − outer_{k}_near" for k in range(1, 7)}
 
 
-@pytest.mark.parametrize("changed", [0, 7])
-def test_one_mistyped_distance_is_named(tmp_path, printer, changed):
-    lengths = printer.shown + np.eye(12)[changed]
+def test_a_mistyped_distance_is_named(tmp_path, printer):
+    lengths = printer.shown + np.eye(12)[7]
     printer.log.write_text(printer.heights + write_analysis(lengths))
     write_printer_import(import_printer_log(printer.log), tmp_path)
     judged = check_session(load_session(tmp_path))
     assert judged.decision.verdict == "review"
-    assert [p.line for f in judged.findings for p in f.places if p.line] == [43 + changed]
+    assert [p.line for f in judged.findings for p in f.places if p.line] == [50]
     wrong = [f for f in judged.findings if f.places and f.severity != "note"]
     assert "DELTA_ANALYZE" in wrong[0].action
-    name = f"center_{changed + 1}_far" if changed < 6 else f"outer_{changed - 5}_far"
-    assert name in judged.decision.reason
+    assert "outer_2_far" in judged.decision.reason
 
 
 def slip(session, changed, millimetres):
@@ -287,7 +288,7 @@ def slip(session, changed, millimetres):
     return replace(session, readings=tuple(readings)), row
 
 
-@pytest.mark.parametrize(("changed", "sign"), [(0, 1), (8, -1), (3, 1), (5, -1)])
+@pytest.mark.parametrize(("changed", "sign"), [(0, 1), (8, -1)])
 def test_a_slip_of_07_is_named_and_one_of_04_accuses_nobody_else(session, changed, sign):
     """0.4 mm is 4.6 to 5.6 standard deviations from what the other readings predict: a gain of log
     likelihood of 7 to 9. The prior odds of one of 30 kinds of mistakes in one of 53 rows take 7.4
@@ -320,18 +321,10 @@ def real_tool_error(printer, fit):
     return tool_error(Printer(printer.robot, printer.errors), as_firmware(fit.settings))
 
 
-@pytest.fixture(scope="module")
-def sound(printer, session):
-    """Tool error without a slip, [mm]."""
-    return real_tool_error(printer, fit_settings(session))
-
-
-@pytest.mark.parametrize("changed", [5, pytest.param(3, marks=pytest.mark.slow)])
-def test_a_slip_of_04_that_is_not_named_is_within_the_stated_tool_error(
-    printer, session, sound, changed
-):
-    """The worst two of 24 such slips: 0.114 and 0.094 mm at the tool, 0.071 mm without a slip."""
-    fit = fit_settings(slip(session, changed, -0.4)[0])
+def test_a_slip_of_04_that_is_not_named_is_within_the_stated_tool_error(printer, session):
+    """The worst of 24 such slips: 0.114 mm at the tool, 0.071 mm without a slip."""
+    sound = real_tool_error(printer, fit_settings(session))
+    fit = fit_settings(slip(session, 5, -0.4)[0])
     wrong = real_tool_error(printer, fit)
     expected = math.hypot(fit.new.tool_rms, fit.tool_uncertainty) / MM
     assert 0.01 < wrong - sound < 0.05

@@ -18,7 +18,6 @@ from klipper_peer import calibrate_as_klipper, locate
 from simulated_printer import Firmware, Printer, nominal, read_settings, rings, write_log
 
 from orthocal import Choice, calibrate, check_session
-from orthocal.assessment.assess import assess
 from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.assessment.words.entries import FIRMWARE_HEADLINES
 from orthocal.measurement.importing.printer_log import import_printer_log
@@ -184,7 +183,7 @@ def test_a_log_with_the_settings_of_another_printer_is_rejected(tmp_path):
     z = printer.probe(nominal(), rings(), noise=0.02, rng=np.random.default_rng(1))
     z += 2.5 * (np.hypot(*rings().T) / 80.0) ** 2  # as with a radius that differs by 12 mm
     log.write_text(write_log("klipper", nominal(), rings(), z, -1.0))
-    decision = assess(calibrate(import_printer_log(log).session, solver="linearised")).decision
+    decision = calibrate(import_printer_log(log).session, solver="linearised").assessment.decision
     assert decision.verdict == "reject"
     assert decision.headline == FIRMWARE_HEADLINES["reject"]
     assert "settings" in decision.action

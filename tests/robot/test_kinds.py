@@ -67,8 +67,7 @@ def slide_directions(machine):
 @pytest.mark.parametrize(
     "machine",
     [
-        *(InclinedOrthoglide(elevation=angle * DEG) for angle in (20, 45, 70)),
-        Biglide(),
+        *(InclinedOrthoglide(elevation=angle * DEG) for angle in (20, 70)),
         SINGLE,
         Biglide(leg=0.2, travel=(0.1, 0.3), attachment=0.02, rods_apart=0.05),
     ],

@@ -36,16 +36,15 @@ def simple_biglide(tmp_path_factory):
     return make_robot(machine, tmp_path_factory.mktemp("made") / "simple")
 
 
-@pytest.fixture(params=["orthoglide", "biglide", "simple"])
+@pytest.fixture(params=["orthoglide", "simple"])
 def machine(request, orthoglide, simple_biglide):
-    made = {"orthoglide": orthoglide, "simple": simple_biglide}
-    return made.get(request.param) or load_robot(request.param)
+    return orthoglide if request.param == "orthoglide" else simple_biglide
 
 
 def test_redundant_errors_have_no_effect_and_all_others_have(machine):
     """Effect of every elementary error by central differences, [m/m, m/rad]."""
     rng = np.random.default_rng(7)
-    tool = rng.uniform(-0.08, 0.05, (4, 3))[:, : len(machine.drives)]
+    tool = rng.uniform(-0.08, 0.05, (2, 3))[:, : len(machine.drives)]
     drives = LoopClosure(machine).inverse(tool)
     for name in machine.parameters.elementary:
         plus, minus = (observed_points(machine, {name: s}, drives) for s in (STEP, -STEP))

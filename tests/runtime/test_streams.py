@@ -50,8 +50,6 @@ def run(words, redirection="", **kwargs):
 
 WORDS = {
     "--version": ["--version"],
-    "--help": ["--help"],
-    "forward": ["forward", "calibration.json", "joints.csv"],
     "calibrate --json": ["calibrate", ".", "--json", "--out", "out"],
 }
 
@@ -63,8 +61,6 @@ FULL, CLOSED = ("> /dev/full", "No space left on device"), (">&-", "it is closed
     ("words", "redirection"),
     [
         ("--version", CLOSED),
-        ("--help", FULL),
-        ("forward", CLOSED),
         ("calibrate --json", FULL),
     ],
 )
@@ -75,10 +71,13 @@ def test_unwritable_output_ends_with_1(words, redirection, folder):
     assert not (folder / "out").exists()
 
 
-@pytest.mark.parametrize("words", [WORDS["forward"], WORDS["--help"]])
-def test_closed_pipe_is_not_an_error(words, folder):
+def test_closed_pipe_is_not_an_error(folder):
     with subprocess.Popen(
-        [*COMMAND, *words], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*COMMAND, "forward", "calibration.json", "joints.csv"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None

@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 from bounds import bound_um
-from calibrated import SOUND, identified
+from calibrated import identified
 from machines import frame_pose
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import SolverOptions, calibrate, draw_errors, load_plan, load_session, write_session
+from orthocal import SolverOptions, draw_errors, load_plan, load_session, write_session
 from orthocal.calibration.identify import identify
 from orthocal.errors import SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -128,15 +128,14 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
 
 
 def test_the_printed_length_is_that_of_the_bar(tmp_path):
-    """The stated length with its estimated error; also where two sessions share it."""
+    """The stated length with its estimated error, which two sessions share."""
     plan = circles(tmp_path, legs=True)
     sessions = [simulate_session(plan, ERRORS, seed=s).session for s in (3, 4)]
-    for measured in (sessions[:1], sessions):
-        calibration = calibrate(measured, "offsets", solver="variable-projection", judgement=SOUND)
-        (error,) = [p.value for p in calibration.sensors if p.name == "gauge.bar.length"]
-        rows = [line.split() for line in to_text(render_sensors(calibration)).splitlines()]
-        (row,) = [r for r in rows if r[:1] == ["gauge.bar.length"]]
-        assert float(row[1]) == pytest.approx(RADIUS_MM + error / MM, abs=6e-4)
+    calibration = identified(sessions, "offsets")
+    (error,) = [p.value for p in calibration.sensors if p.name == "gauge.bar.length"]
+    rows = [line.split() for line in to_text(render_sensors(calibration)).splitlines()]
+    (row,) = [r for r in rows if r[:1] == ["gauge.bar.length"]]
+    assert float(row[1]) == pytest.approx(RADIUS_MM + error / MM, abs=6e-4)
 
 
 def test_a_simulated_session_comes_back_from_its_files(tmp_path):

@@ -36,25 +36,21 @@ def every_second(plan):
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
-    plan = circles(tmp_path_factory.mktemp("mistakes"))
+    plan = every_second(circles(tmp_path_factory.mktemp("mistakes")))
     return simulate_session(plan, errors_of(plan, 2), seed=2).session
 
 
-def reverse_setup(values, setup):
-    values[setup == "yz"] *= -1.0
-
-
 def reverse_one(values, setup):
-    values[20] *= -1.0
+    values[10] *= -1.0
 
 
 def bump(values, setup):
     """The fixed ball moves towards the bar between two readings."""
-    values[np.flatnonzero(setup == "zx")[8:]] += 50e-6
+    values[np.flatnonzero(setup == "zx")[4:]] += 50e-6
 
 
 def swap(values, setup):
-    values[[5, 9]] = values[[9, 5]]
+    values[[3, 5]] = values[[5, 3]]
 
 
 def inches(values, setup):
@@ -62,7 +58,6 @@ def inches(values, setup):
 
 
 MISTAKES = {
-    reverse_setup: ("reversed sign", "yz"),
     reverse_one: ("reversed sign", "yz"),
     bump: ("displaced gauge", "zx"),
     swap: ("swapped rows", "xy"),
@@ -95,31 +90,29 @@ def test_a_bar_with_all_signs_reversed_is_named(tmp_path):
     assert {p.setup for p in found.places} == {"xy", "yz", "zx"}
 
 
-@pytest.mark.parametrize("seed", [2, 31])
-def test_a_later_bar_with_all_signs_reversed_is_named(tmp_path, seed):
+def test_a_later_bar_with_all_signs_reversed_is_named(tmp_path):
     """To first order about the readings as stated, the reversed sign has no evidence."""
     plan = every_second(circles(tmp_path, length="0", legs=True))
     first = plan.select([r for r in plan.readings if r.setup.startswith("leg")])
     later = plan.select([r for r in plan.readings if r.setup == "xy"])
-    errors = errors_of(plan, seed)
-    legs = simulate_session(first, errors, seed=seed).session
-    bar = simulate_session(later, errors, seed=seed + 50).session
+    errors = errors_of(plan, 2)
+    legs = simulate_session(first, errors, seed=2).session
+    bar = simulate_session(later, errors, seed=52).session
     assert not warnings_of(join_sessions([legs, bar]))
     (found,) = warnings_of(join_sessions([legs, bar.with_values(-bar.values)]))
     assert found.kind == "reversed sign"
     assert [p.setup for p in found.places] == ["session-2/xy"]
 
 
-@pytest.mark.parametrize(("first", "size"), [("yz", 50e-6), ("zx", 0.3e-3)])
-def test_a_ball_displaced_between_setups_is_named(tmp_path, first, size):
+def test_a_ball_displaced_between_setups_is_named(tmp_path):
     plan = every_second(circles(tmp_path))
     errors = errors_of(plan, 1)
     simulated = simulate_session(plan, errors, seed=1)
     names = [p.name for p in nuisance_parameters(plan).parameters]
     nuisance = np.array([simulated.nuisance.get(name, 0.0) for name in names])
-    displaced = nuisance + size * np.array([name.startswith("ball.post.") for name in names])
+    displaced = nuisance + 50e-6 * np.array([name.startswith("ball.post.") for name in names])
     before, after = (predict_readings(plan, errors, nuisance=n) for n in (nuisance, displaced))
-    later = ["yz", "zx"][["yz", "zx"].index(first) :]
+    later = ["yz", "zx"]
     changed = [r.setup in later for r in plan.readings]
     values = simulated.session.values + np.where(changed, after - before, 0.0)
     found = warnings_of(simulated.session.with_values(values))
@@ -185,8 +178,7 @@ def test_a_gauge_block_of_another_height_is_named(tmp_path):
     assert found.numbers["stated_mm"] == height
 
 
-@pytest.mark.parametrize("wrong", [("yz",), ("xy", "yz", "zx")], ids="-".join)
-def test_a_bar_that_was_zeroed_on_the_machine_is_named(tmp_path, wrong):
+def test_a_bar_that_was_zeroed_on_the_machine_is_named(tmp_path):
     """Each setup has another zero. A bar of another length has the same change in all setups."""
     plan = every_second(circles(tmp_path))
     sensors = {n: replace(s.sensor, length_std=0.0) for n, s in plan.setups.items()}
@@ -196,14 +188,14 @@ def test_a_bar_that_was_zeroed_on_the_machine_is_named(tmp_path, wrong):
     )
     session = simulate_session(plan, errors_of(plan, 1), seed=1).session
     assert warnings_of(session) == []
-    zeros = dict(zip(wrong, (0.31e-3, -0.22e-3, 0.17e-3), strict=False))
-    session = session.with_values([r.value + zeros.get(r.setup, 0.0) for r in session.readings])
+    zeros = {"xy": 0.31e-3, "yz": -0.22e-3, "zx": 0.17e-3}
+    session = session.with_values([r.value + zeros[r.setup] for r in session.readings])
     found = warnings_of(session)
     assert {f.kind for f in found} == {"wrong dimension"}
-    assert {p.setup for f in found for p in f.places} == set(wrong)
+    assert {p.setup for f in found for p in f.places} == set(zeros)
     assert "or the dial was not zeroed at 50 mm" in found[0].text
     assert "`zero: free`" in found[0].action
-    free = {n: replace(s, zero="free") if n in wrong else s for n, s in session.setups.items()}
+    free = {n: replace(s, zero="free") for n, s in session.setups.items()}
     assert warnings_of(replace(session, setups=free)) == []
 
 
@@ -231,8 +223,8 @@ def two_sessions(folder, seed, *, change, stated=None):
     return join_sessions([first.session, second.with_values(np.array(second.values) - change)])
 
 
-@pytest.mark.parametrize("change", [60e-6, -0.3e-3])
-def test_a_bar_that_was_readjusted_between_sessions_is_named(tmp_path, change):
+def test_a_bar_that_was_readjusted_between_sessions_is_named(tmp_path):
+    change = 60e-6
     session = two_sessions(tmp_path, 1, change=change)
     (found,) = warnings_of(session)
     assert found.kind == "readjusted dimension"
@@ -241,9 +233,8 @@ def test_a_bar_that_was_readjusted_between_sessions_is_named(tmp_path, change):
     assert "before session session-2" in found.text
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_sessions_with_one_bar_are_not_accused(tmp_path, seed):
-    assert warnings_of(two_sessions(tmp_path, seed, change=0.0)) == []
+def test_sessions_with_one_bar_are_not_accused(tmp_path):
+    assert warnings_of(two_sessions(tmp_path, 0, change=0.0)) == []
 
 
 @pytest.mark.parametrize("stated", ["name", "length"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from calibrated import calibrated, plan_of, session_of
+from calibrated import UNJUDGED, calibrated, plan_of, session_of
 
 from orthocal import (
     SessionError,
@@ -43,13 +43,12 @@ def ordered(session, order):
 
 @pytest.fixture(scope="module")
 def calibration():
-    return calibrated("workshop", "full", **QUICK)
+    return calibrated("workshop", "full", **UNJUDGED)
 
 
-@pytest.mark.parametrize("order", ORDER)
-def test_the_order_of_rows_changes_no_estimate(order, workshop, calibration):
+def test_the_order_of_rows_changes_no_estimate(workshop, calibration):
     other, _ = identify(
-        ordered(workshop, order),
+        ordered(workshop, "shuffled"),
         "full",
         find_scale=lambda _: calibration.tolerance_scale,
         **QUICK,
@@ -96,18 +95,14 @@ def with_other_gauge_first(session):
 
 
 @pytest.mark.parametrize(
-    ("setups_of_second", "scale", "settings"),
+    ("setups_of_second", "scale", "settings", "cycles"),
     [
-        ({1, 3, 5}, 1.0, {}),
-        ({1, 3, 5}, 5.0, {}),
-        ({1, 3, 5}, 0.1, {}),
-        ({1}, 5.0, {}),
-        ({1, 3, 5}, 5.0, {"loss": "huber"}),
-        ({1, 3, 5}, 5.0, {"choice": "offsets"}),
+        ({1, 3, 5}, 5.0, {}, False),
+        ({1}, 5.0, {}, True),
+        ({1, 3, 5}, 5.0, {"loss": "huber"}, False),
     ],
-    ids=["as stated", "more", "less", "few readings", "robust", "offsets"],
+    ids=["more", "few readings", "robust"],
 )
-@pytest.mark.parametrize("cycles", [False, True], ids=["once", "cycles"])
 def test_the_order_of_gauges_changes_no_estimate(setups_of_second, scale, settings, cycles):
     session = with_two_gauges(setups_of_second, scale)
     if not cycles:

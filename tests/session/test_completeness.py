@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibrated import session_of
 
-from orthocal import Conditions, Mounting, Tip, calibrate, judge_session
+from orthocal import Conditions, Mounting, Section, Tip, calibrate, check_session, judge_session
 from orthocal.errors import SessionError
 from orthocal.session.completeness import require_complete
 
@@ -29,6 +29,12 @@ def first_setup(session, **changes):
     """Session whose first setup is changed."""
     name, setup = next(iter(session.setups.items()))
     return replace(session, setups={**session.setups, name: replace(setup, **changes)})
+
+
+def first_sensor(session, **changes):
+    """Session in which the sensor of the first setup is changed."""
+    sensor = next(iter(session.setups.values())).sensor
+    return first_setup(session, sensor=replace(sensor, **changes))
 
 
 WRONG = {
@@ -57,6 +63,14 @@ WRONG = {
     "aligned": (lambda s: first_setup(s, aligned_at="p"), ".aligned_at", "'p' is not a posture"),
     "payload": (lambda s: first_setup(s, payload=-1.0), ".payload", "found -1.0"),
     "sensor": (lambda s: first_setup(s, sensor=None), ".sensor", "expected a sensor"),
+    "minus": (lambda s: first_reading(s, minus="up"), "readings", "'up' is not a posture"),
+    "leg": (lambda s: first_sensor(s, leg="w"), ".leg", "'w' is not a leg of orthoglide"),
+    "direction": (lambda s: first_sensor(s, direction="q"), "setups.yx.direction", "found 'q'"),
+    "section": (
+        lambda s: first_sensor(s, section=Section("fraction", 1.5)),
+        "setups.yx",
+        "found 1.5; expected 0",
+    ),
     "name": (lambda s: first_setup(s, name="xx"), "setups.", "has the name 'xx'"),
     "adjusted": (lambda s: replace(s, adjusted={"a": 1e-3}), "adjusted", "'a' is not an adjust"),
     "list": (lambda s: replace(s, postures=[*s.postures.values()]), "postures", "found a list"),
@@ -69,6 +83,12 @@ def test_a_session_that_cannot_be_calibrated_is_refused(session, change, place, 
     with pytest.raises(SessionError, match=problem) as caught:
         require_complete(change(session))
     assert place in str(caught.value)
+
+
+def test_every_use_checks_the_session(session):
+    for use in (calibrate, check_session):
+        with pytest.raises(SessionError, match="'xx' is not a setup"):
+            use(first_reading(session, setup="xx"))
 
 
 def test_sizes_of_tips_and_mountings_are_not_negative():

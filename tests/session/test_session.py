@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from calibrated import session_of
@@ -13,11 +11,9 @@ from tolerances import CLOSED_FORM, KINEMATICS
 
 from orthocal import (
     Gauge,
-    Reading,
     Section,
     Tip,
     calibrate,
-    check_session,
     load_plan,
     load_session,
     plan_readings,
@@ -187,31 +183,6 @@ def test_a_session_written_elsewhere_has_its_robot(root, tmp_path):
 )
 def test_names_of_joined_sessions_have_a_label(name, joined, parts):
     assert split_label(name, joined=joined) == parts
-
-
-def with_sensor(session, **changes):
-    """The session with another sensor in its first setup."""
-    name, setup = next(iter(session.setups.items()))
-    changed = replace(setup, sensor=replace(setup.sensor, **changes))
-    return replace(session, setups={**session.setups, name: changed})
-
-
-SPOILT_IN_PYTHON = [
-    (lambda s: s.select([Reading("nowhere", "zero", value=1e-3)]), "'nowhere' is not a setup"),
-    (lambda s: s.select([Reading("yx", "nowhere", value=1e-3)]), "'nowhere' is not a posture"),
-    (lambda s: s.select([Reading("yx", "zero", "up", value=1e-3)]), "'up' is not a posture"),
-    (lambda s: with_sensor(s, leg="w"), "'w' is not a leg of orthoglide"),
-    (lambda s: with_sensor(s, direction="q"), "setups.yx.direction: found 'q'"),
-    (lambda s: with_sensor(s, section=Section("fraction", 1.5)), "found 1.5; expected 0"),
-    (lambda s: s.select([Reading("yx", "zero")]), "have no value|no reading is entered"),
-]
-
-
-@pytest.mark.parametrize(("spoil", "message"), SPOILT_IN_PYTHON)
-@pytest.mark.parametrize("use", [calibrate, check_session])
-def test_a_session_that_was_made_in_python_is_checked(raw_cycles, use, spoil, message):
-    with pytest.raises(SessionError, match=message):
-        use(spoil(raw_cycles))
 
 
 def test_a_plan_is_not_calibrated(root):

@@ -213,19 +213,6 @@ def test_undetermined_offsets_are_named(raw_cycles):
     assert caught.value.parameters == ("z_slide.offset",)
 
 
-def test_six_equations_have_the_closed_form_covariance(experiment_2):
-    problem = build_problem(exact(experiment_2), model="offsets")
-    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
-    information = decompose(jacobian, problem.observations)
-    scale = np.outer(problem.theta_scale, problem.theta_scale)
-    precision = problem.prior_precision
-    covariance = (
-        information.posterior(sigma=1.0 / np.sqrt(2.0), precision=precision).covariance * scale
-    )
-    assert np.abs(np.sqrt(np.diag(covariance)) - 1.4031).max() < 0.00006
-    assert abs(covariance[0, 1] / covariance[0, 0] + 0.25) < 0.005
-
-
 def test_predicted_covariance_is_that_of_many_simulated_calibrations():
     """The whitened errors of the complete model are standard normal in all directions."""
     sigma = 20e-6

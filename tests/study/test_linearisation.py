@@ -95,8 +95,9 @@ def test_scatter_agrees_with_the_standard_errors(study):
     for name, differences, covariance in prepared.paper_methods():
         matrix = prepared.matrices[len(differences)]
         rows = noise @ differences.T
-        offsets = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in rows]
-        scatter = np.std(offsets, axis=0).max()
+        units = np.eye(len(differences))  # offsets are linear in the differences
+        gains = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in units]
+        scatter = np.std(rows @ np.array(gains), axis=0).max()
         assert abs(scatter / study.standard_errors[name] - 1.0) < 4.0 / np.sqrt(2.0 * count)
 
 
@@ -155,15 +156,6 @@ def test_gauss_newton_diverges_on_short_legs(tmp_path):
     found = summarise_linearisation(study, run_study(study))
     assert found.steps[0] is not None
     assert found.steps[1] is None or found.steps[1] > 5 or found.measurable < 60.0
-
-
-def test_longer_legs_are_less_nonlinear(tmp_path, orthoglide):
-    longer = make_robot(Orthoglide(leg=0.6205, travel=(0.43, 0.7)), tmp_path / "long")
-    errors = [
-        run_task(build_linearisation_study(r, sizes=[2.0], along=ALONG), 0)["first_order"][0]
-        for r in (orthoglide, longer)
-    ]
-    assert errors[1] < 0.6 * errors[0]
 
 
 def test_session_and_other_errors(root):

@@ -7,10 +7,13 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import pytest
 from commands import run_orthocal
 from processes import children_of, is_running, until
+
+from orthocal.runtime import interrupts
 
 FILES = {"results.jsonl", "results.parquet", "study.json", "study.svg"}
 
@@ -50,10 +53,11 @@ def test_answer_and_files(tmp_path, root, kind):
     picture = (tmp_path / "study.svg").read_text()
     assert picture.startswith('<?xml version="1.0"')
     assert "mathdefault" not in picture
-    before = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
-    code, again, _ = run_orthocal(root, "study", *words)
-    assert (code, again) == (0, out)
-    assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == before
+    if kind == "bootstrap":
+        before = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
+        code, again, _ = run_orthocal(root, "study", *words)
+        assert (code, again) == (0, out)
+        assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == before
 
 
 def test_json_output(root):
@@ -76,10 +80,21 @@ def test_leg_length(root):
     assert found[0] > 1.2 * found[1]
 
 
-@pytest.mark.parametrize("out", [True, False])
-def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root, out):
+def test_without_a_directory_an_interrupt_names_the_option(root, monkeypatch):
+    messages = []
+
+    def record(message):
+        messages.append(message)
+        return nullcontext()
+
+    monkeypatch.setattr(interrupts, "message_at_interrupt", record)
+    assert run_orthocal(root, "study", "sensitivity", "--free", "offsets")[0] == 0
+    assert messages == ["orthocal: stopped; with --out it can be resumed"]
+
+
+def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root):
     words = ["bootstrap", str(root / "examples/raw-cycles"), "--draws", "100000", "--workers", "2"]
-    words += ["--out", str(tmp_path)] if out else []
+    words += ["--out", str(tmp_path)]
     command = [sys.executable, "-m", "orthocal", "study", *words]
     process = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, process_group=0
@@ -90,7 +105,7 @@ def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root, out)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     last = errors.splitlines()[-1]
-    assert ("the same command resumes it" if out else "--out") in last
+    assert "the same command resumes it" in last
     assert "Traceback" not in errors
     until(lambda: not any(map(is_running, children)))
 

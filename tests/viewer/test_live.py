@@ -222,16 +222,16 @@ def test_two_views_find_two_ports(scene):
 # ---- in another process
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_view_ends_cleanly_on_a_signal(number):
-    """It has no children, and its port is free even if it is killed."""
+    """It has no children, and its port is free afterwards."""
     process, port = start()
     assert listening(process.pid) == [("127.0.0.1", port)]
     assert children_of(process.pid) == []
     assert get(port)[0] == 200
     process.send_signal(number)
     _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == (-number if number == signal.SIGKILL else 0)
+    assert process.returncode == 0
     assert errors == "Open this in a browser on this machine; Ctrl-C ends.\n"
     assert not is_open(port)
 

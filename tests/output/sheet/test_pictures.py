@@ -39,7 +39,9 @@ def plan(tmp_path_factory):
         for i, (leg, way, at, tip) in enumerate(
             (leg, way, (0.3, 0.5, 0.7)[k % 3], tip)
             for leg, ways in SECTIONS.items()
-            for k, (way, tip) in enumerate(product(ways, ("", *(f", {t}" for t in TIPS))))
+            for k, (way, tip) in enumerate(
+                product(ways, ("", *(f", {t}" for t in TIPS[leg != "x" :: 2])))
+            )
         )
     ]
     path = tmp_path_factory.mktemp("plan") / "plan.yaml"
@@ -73,9 +75,9 @@ def overlap(one, other):
 
 def test_no_label_overlaps_another_or_the_border(plan, drawn):
     pictures, _ = drawn
-    assert len(pictures) == 2 * len(plan.setups) == 2 * 50
+    assert len(pictures) == 2 * len(plan.setups) == 2 * 30
     texts = [label.text for picture, _ in pictures for label in picture.labels]
-    assert sum("off centre" in text for text in texts) == 20
+    assert sum("off centre" in text for text in texts) == 10
     for picture, placed in pictures:
         assert len(placed) == len(picture.labels)
         for one, other in combinations(placed, 2):

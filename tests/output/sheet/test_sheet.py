@@ -264,15 +264,13 @@ def test_tip_near_a_hinge_causes_a_warning(small):
     assert text.count("of the middle of a hinge") == 1
 
 
-@pytest.mark.parametrize("name", ["raw_cycles", "experiment_2"])
-def test_sessions_have_sheets(request, name):
-    session = request.getfixturevalue(name)
+def test_sessions_have_sheets(experiment_2):
+    session = experiment_2
     found = sheet_files(session)
     assert len(found) == 1 + len({r.setup for r in session.readings})
     page = etree.HTML(found["sheet.html"])
     assert len(page.xpath("//td[@class='box']")) >= len(session.readings)
-    if name == "experiment_2":
-        assert "set to 0" in words(page.find("body"))
+    assert "set to 0" in words(page.find("body"))
 
 
 def test_a_planar_robot_has_a_sheet(root, tmp_path):
@@ -337,37 +335,41 @@ PAGE_HEIGHT = (297.0 - 2.0 * 12.0) / 25.4 * 96.0
 """Height of an A4 page within the sheet's margins, [px]."""
 
 
+@pytest.fixture(scope="module")
+def browser():
+    with open_browser() as found:
+        yield found
+
+
 @contextmanager
-def printed_sheet(plan, folder):
+def printed_sheet(browser, plan, folder):
     """The sheet of a plan in a browser, as it is printed on A4."""
     path = folder / "sheet.html"
     path.write_text(sheet_files(plan)["sheet.html"])
-    with open_browser() as browser, visit(browser, path.as_uri()) as found:
+    with visit(browser, path.as_uri()) as found:
         found.page.set_viewport_size({"width": round(PRINTED), "height": 1000})
         found.page.emulate_media(media="print")
         yield found.page
 
 
-@pytest.mark.parametrize("effects", [(), ("backlash", "thermal", "drift")])
-def test_tables_of_readings_are_as_wide_as_the_text(small, effects, tmp_path):
+def test_tables_of_readings_are_as_wide_as_the_text(browser, small, tmp_path):
     """With columns for approach, temperature and time, and for what a perfect machine shows."""
-    plan = small.with_effects(effects)
-    if effects:
-        readings = [
-            replace(r, conditions=Conditions(approach="pn"[i % 2] * 3))
-            for i, r in enumerate(plan.readings)
-        ]
-        plan = replace(plan, readings=tuple(readings))
-    with printed_sheet(plan, tmp_path) as page:
+    plan = small.with_effects(("backlash", "thermal", "drift"))
+    readings = [
+        replace(r, conditions=Conditions(approach="pn"[i % 2] * 3))
+        for i, r in enumerate(plan.readings)
+    ]
+    plan = replace(plan, readings=tuple(readings))
+    with printed_sheet(browser, plan, tmp_path) as page:
         widths = page.evaluate(
             """() => [...document.querySelectorAll('table')].map((table) =>
                  [table.getBoundingClientRect().right, table.rows[0].cells.length])"""
         )
     assert max(right for right, _ in widths) <= round(PRINTED) + 0.5
-    assert max(columns for _, columns in widths) == (12 if effects else 9)
+    assert max(columns for _, columns in widths) == 12
 
 
-def test_a_setup_of_ten_readings_fits_on_a_page(tmp_path):
+def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
     """As the front page does, with offsets and backlash that are compensated."""
     make_robot(SMALL, tmp_path / "mine", counting=COUNTING)
     postures, setups = "", ""
@@ -387,7 +389,7 @@ def test_a_setup_of_ten_readings_fits_on_a_page(tmp_path):
     plan = load_plan(tmp_path / "plan.yaml").with_effects(["backlash"])
     approached = [replace(r, conditions=Conditions(approach="pnp")) for r in plan.readings]
     plan = replace(plan, readings=tuple(approached))
-    with printed_sheet(plan, tmp_path) as page:
+    with printed_sheet(browser, plan, tmp_path) as page:
         front, *heights = page.evaluate(
             """() => {
                  const boxes = [...document.querySelectorAll('section[id]')].map(
