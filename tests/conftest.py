@@ -69,16 +69,10 @@ IN_LINUXCNC = (
 
 
 def pytest_collection_modifyitems(items):
-    """What takes longest begins first: at the end others would wait for it.
-
-    A worker runs all tests of a file, which share fixtures.
-    """
+    """What takes longest begins first: at the end others would wait for it."""
     first = (*LONGEST, *IN_LINUXCNC)
     place = {name: i for i, name in enumerate(first)}
     items.sort(key=lambda item: place.get(item.path.name, len(first)))
-    for item in items:
-        name = "linuxcnc" if item.path.name in IN_LINUXCNC else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(name))
 
 
 def pytest_collection_finish():
