@@ -252,7 +252,7 @@ def test_command_and_report_list_the_planned_adjustments(machines, tmp_path):
     assert "--among" in err
     new = tmp_path / "new"
     foot = "x_side_foot_z"
-    for amounts in ("w_foot=1", f"{foot}=.1,{foot}=.1"):
+    for amounts in (foot, "w_foot=1", f"{foot}=99", f"{foot}=.1,{foot}=.1"):
         code, _, err = run("again", tmp_path, "--adjusted", amounts, "--out", new)
         assert code == 2
         assert "--adjusted" in err

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import run_orthocal
+from conftest import no_sensor_gains
 from effect_plans import write_plan, write_robot
 
 from orthocal import (
@@ -357,6 +358,9 @@ def test_assumed_conditions_are_stated_with_their_cost(folder, calibration):
 
 def test_accuracy_is_under_stated_conditions(folder, calibration):
     stated = ("--approach", "ppp", "--temperature", "25", "--payload", "2")
+    with no_sensor_gains():
+        _, text, _ = run_orthocal(folder, "accuracy", ".", *stated)
+    assert "Conditions: approach ppp, 25 °C and payload 2 kg." in " ".join(text.split())
     _, text, _ = run_orthocal(folder, "accuracy", ".", *stated, "--json")
     document = json.loads(text)
     use = UseConditions("ppp", 25.0, 2.0)

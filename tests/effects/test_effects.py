@@ -428,6 +428,10 @@ def test_readings_without_the_condition_are_refused(tmp_path):
         identify(replace(session, readings=numbered), Choice(free=FREE, effects=["slack"]))
     assert f"column `approach` is missing or empty in {last}. The effect" in str(caught.value)
     assert f"{n} of {n} readings" in str(caught.value)
+    one, other = session.readings[:2]
+    difference = replace(session, readings=(replace(one, minus=other.posture),))
+    with pytest.raises(SessionError, match="belongs to two postures, so that it states no cond"):
+        identify(difference, Choice(free=FREE, effects=["slack"]))
     # errors of an effect that only the robot has keep their tolerances
     kept = identify(session, Choice(free=FREE), **QUICK)[0]["x_slide.slack"]
     assert (kept.value, kept.std) == pytest.approx((0.0, 40e-6), rel=1e-6)

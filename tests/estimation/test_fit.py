@@ -7,6 +7,7 @@ import pytest
 from calibrated import UNJUDGED, identified
 from models import TRUTH
 from scipy.optimize import lsq_linear
+from tolerances import SAME_OPTIMUM
 
 from orthocal import Choice, SolverOptions, calibrate, simulate_session
 from orthocal.estimation.fit import fit_problem
@@ -52,6 +53,15 @@ def test_a_parameter_at_its_bound_acts_like_a_known_value(session):
     for name in ("y_slide.offset", "z_slide.offset"):
         assert bounded[name].value == pytest.approx(known[name].value, abs=1e-8)
         assert bounded[name].std == pytest.approx(known[name].std, rel=1e-3)
+
+
+def test_bounds_that_do_not_bind_change_nothing(session):
+    free = identified(session)
+    bounded = identified(session, Choice(bounds={"*.offset_m": (-5e-3, 5e-3)}))
+    for a, b in zip(free.free, bounded.free, strict=True):
+        assert a.value == pytest.approx(b.value, abs=SAME_OPTIMUM)
+        assert a.std == pytest.approx(b.std, rel=1e-6)
+        assert b.at_bound is None
 
 
 def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):

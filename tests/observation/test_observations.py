@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from derivatives import central_differences
 from machines import reading_by_pinocchio
-from tolerances import KINEMATICS
+from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 
 from orthocal import load_plan, load_session
 from orthocal.observation.contacts import locate_contacts
@@ -16,6 +17,13 @@ from orthocal.observation.observations import build_observations
 from orthocal.sensors.leg_indicator import Section
 
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
+
+
+def differences(session, offsets):
+    o = build_observations(session)
+    return o.rows(
+        predict_readings(session, dict(zip(OFFSETS, offsets, strict=True)), observations=o)
+    )
 
 
 def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
@@ -52,6 +60,40 @@ def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
             seen.add((pair[0].name, pair[1].name))
             assert abs(ours[i] - reading_by_pinocchio(plan, machine, *pair)) < KINEMATICS
     assert len(seen) == 18
+
+
+def test_equation_7_comes_out_of_the_urdf(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    rows = [r for r in plan.readings if r.setup == "yx" and r.cycle == 1]
+    plan = replace(plan, readings=tuple(rows))
+    slope = central_differences(lambda d: differences(plan, d), np.zeros(3), step=1e-6)
+    zero, x_max, x_min = slope
+    assert np.abs((x_max - zero) - [0.13668, 0.19339, 0.0]).max() < PRINTED
+    assert np.abs((x_min - zero) - [-0.06050, -0.32232, 0.0]).max() < PRINTED
+
+
+@pytest.mark.parametrize(("size", "expected_mm"), [(1, 0.0015), (2, 0.006), (5, 0.039)])
+def test_linearisation_error_grows_with_the_square_of_the_offsets(experiment_2, size, expected_mm):
+    offsets = 1e-3 * size * np.array([1.0, -0.6, 0.3])
+    slope = central_differences(lambda d: differences(experiment_2, d), np.zeros(3), step=1e-6)
+    error = np.abs(differences(experiment_2, offsets) - slope @ offsets).max()
+    assert abs(error - expected_mm * 1e-3) < THREE_DECIMALS_MM
+
+
+def test_a_negative_direction_turns_the_sign(raw_cycles):
+    o = build_observations(raw_cycles)
+    errors = {"x_slide.offset": 1e-3}
+    turned = {
+        n: replace(s, sensor=replace(s.sensor, direction=f"-{s.sensor.direction}"))
+        for n, s in raw_cycles.setups.items()
+    }
+    there = predict_readings(replace(raw_cycles, setups=turned), errors, observations=o)
+    assert np.abs(there + predict_readings(raw_cycles, errors, observations=o)).max() < KINEMATICS
+
+
+def test_a_perfect_machine_shows_no_deviation(raw_cycles):
+    o = build_observations(raw_cycles)
+    assert np.abs(predict_readings(raw_cycles, observations=o)).max() < KINEMATICS * 10
 
 
 def test_offsets_that_the_controller_corrects_do_not_show(raw_cycles):

@@ -10,6 +10,7 @@ import pytest
 from derivatives import central_differences
 from gauges import exact
 from models import TRUTH
+from scipy.optimize import least_squares
 from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
 from orthocal import load_plan, load_session, simulate_session
@@ -19,6 +20,7 @@ from orthocal.estimation.loss import SQUARES, Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.statistics.zeros import project_out_zeros
 
 HUBER = Loss("huber")
 
@@ -137,6 +139,24 @@ def test_both_hessians_reach_the_same_optimum(exact_plan):
     gap = np.abs(found[0].theta - found[1].theta)
     assert (gap / np.maximum(problem.theta_scale, 1e-3)).max() < 1e-6
     assert abs(found[0].objective / found[1].objective - 1.0) < 1e-9
+
+
+def test_another_solver_finds_the_same(exact_plan):
+    """SciPy's least squares on the reduced problem, loops closed by Newton at every step."""
+    session = simulate_session(exact_plan, TRUTH, seed=4).session
+    problem = build_problem(session, model="lengths")
+    solution = NonlinearProgram(problem).solve(sigma=1e-5)
+
+    def residuals(theta_hat):
+        left = problem.values - problem.predict(theta_hat * problem.theta_scale)
+        whitened = project_out_zeros(left, problem.observations) / 1e-5
+        return np.r_[whitened, theta_hat * problem.has_prior]
+
+    other = least_squares(
+        residuals, np.zeros(problem.n_free), jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12
+    )
+    assert np.abs(other.x * problem.theta_scale - solution.theta).max() < SAME_OPTIMUM
+    assert other.cost == pytest.approx(solution.objective, rel=1e-9)
 
 
 def test_new_readings_do_not_rebuild(exact_plan):

@@ -14,7 +14,10 @@ from orthocal.calibration.file import calibration_json
 from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
+    SIX_ROWS,
+    leg_parallelism_matrix,
     linearise_problem,
+    solve_equation_8,
 )
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
@@ -102,6 +105,20 @@ def test_a_machine_with_offsets_of_a_centimetre_has_one_optimum(root):
     offsets = [batch.theta[0, problem.free.index(f"{axis}_slide.offset")] for axis in "xyz"]
     assert offsets == pytest.approx(FAR_OFFSETS, abs=1e-7)
     assert batch.objective[0] < problem.observations.size
+
+
+def test_linearised_offsets_of_the_paper_are_those_of_equation_8():
+    """Residuals and offsets of Experiment 2 by the matrix of the paper."""
+    session = exact(session_of("table1/experiment-2"))
+    problem = build_problem(session, model="offsets")
+    matrix = leg_parallelism_matrix(
+        length=0.31025, displacement_max=0.06, displacement_min=-0.1, rows=6
+    )
+    rows = {(r.setup, r.posture): r.value for r in session.readings}
+    assert len(rows) == 6
+    differences = [rows[name, f"{name[1]}_max"] for name in SIX_ROWS]
+    offsets = solve_equation_8(matrix, differences).offsets
+    assert LinearisedProgram(problem).solve(sigma=1e-5).theta == pytest.approx(offsets, abs=1e-8)
 
 
 def test_the_linearised_solver_minimises_a_robust_loss():
