@@ -15,8 +15,11 @@ from models import TRUTH
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.plausibility import describe_legs, find_implausible, find_impossible_gauges
+from orthocal.assessment.words.effects import approach_incomplete
+from orthocal.assessment.words.plausibility import outstanding_error
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
+from orthocal.estimation.problem import build_problem
 from orthocal.output.text.answer import describe_machine
 
 
@@ -207,3 +210,25 @@ def test_postures_of_another_session_are_not_too_near(cycles):
     name = next(p for p in cycles.postures if p != "zero")
     both = join_sessions([cycles, near(later, name, "zero")])
     assert "postures too near" in kinds(both)
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("setup.yx.roll", "Read setup yx again: a wrong reading, such as a dial misread by one"),
+        ("x_slide.offset", "Measure that place or part again."),
+    ],
+)
+def test_an_error_of_a_mounting_may_be_a_wrong_reading(name, advice):
+    problem = build_problem(session_of("workshop"), model="offsets")
+    (parameter,) = (p for p in problem.parameters if p.name == name)
+    found = outstanding_error(parameter, 0.1)
+    assert found.severity == "reject"
+    assert found.action.startswith(advice)
+
+
+@pytest.mark.parametrize(("two", "advice"), [(False, "Complete the column"), (True, "Differences")])
+def test_differences_of_two_postures_cannot_state_an_approach(two, advice):
+    found = approach_incomplete([3, 4], 2, 9, two_postures=two)
+    assert found.text.startswith("2 of 9 readings (lines 3, 4) do not state")
+    assert found.action.startswith(advice)
