@@ -82,6 +82,14 @@ def test_the_printed_first_experiment_contradicts_itself(results):
     assert abs(results["experiment-1-corrected"].rms_before * 1e3 - 1.19) < 0.005
 
 
+def test_residuals_of_experiments_2_and_3_are_the_same(results):
+    """The paper's rounded residuals correlate 0.992, unrounded ones no less."""
+    printed = [PAPER_RESIDUALS[f"experiment-{n}"] for n in (2, 3)]
+    assert abs(np.corrcoef(*printed)[0, 1] - 0.992) < 0.0005
+    a, b = ([r.residual for r in results[f"experiment-{n}"].residuals] for n in (2, 3))
+    assert abs(np.corrcoef(a, b)[0, 1] - 0.9937) < 0.0005
+
+
 def test_sigma_is_that_of_a_difference_with_three_degrees_of_freedom(results):
     c = results["experiment-2"]
     assert c.rows_are_differences
