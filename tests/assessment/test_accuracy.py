@@ -11,15 +11,17 @@ import numpy as np
 import plans
 import pytest
 from calibrated import UNJUDGED, identified, plan_of, session_of
+from closed_form import inverse
 from conftest import ROOT
 from derivatives import assert_derivative
 from gauges import exact
-from machines import write_orthoglide
+from machines import place, write_orthoglide
 from models import JOINTS
 
 from orthocal import (
     Choice,
     calibrate,
+    compare_models,
     draw_errors,
     load_plan,
     load_robot,
@@ -69,6 +71,7 @@ offsets; error without translation and rotation, of both. The direction and plac
 exact; the aligned error of the complete model is stated where they do not matter.
 """
 
+BEFORE, BEFORE_ALIGNED = 0.579, 0.415
 SAMPLING = 0.03
 """Relative: the points of that model in the cube and its fourth digit are not known."""
 
@@ -228,7 +231,16 @@ def test_the_workspace_of_a_small_machine_is_within_its_reach(tmp_path):
     assert find_workspace(session.robot).half_side == pytest.approx(0.027)
     text = " ".join(summarize(result, details=True).split())
     assert "Over the workspace ±27 mm." in text
+    compared = compare_models(session, models=["offsets"], options=FAST)
     assert result.assessment.tool.region == "±27 mm"
+    assert compared.assessment.tool.box == result.assessment.tool.box
+    assert all(r.tool is not None for r in compared.results)
+
+
+def test_before_calibration(jacobian, tolerances, workspace):
+    found = measure_uncertainty(jacobian, np.diag(tolerances**2), workspace, workspace.points)
+    assert found.sizes.relative.rms * 1e3 == pytest.approx(BEFORE, rel=SAMPLING)
+    assert found.sizes.aligned.rms * 1e3 == pytest.approx(BEFORE_ALIGNED, rel=SAMPLING)
 
 
 @pytest.mark.parametrize(
@@ -281,6 +293,18 @@ def calibrate_example(name, model):
 def sweep():
     """Calibrations of the sweep by their models."""
     return {model: calibrate_example("sweep", model) for model in ("offsets", "lengths", "full")}
+
+
+def test_the_tool_is_where_pinocchio_places_it(sweep):
+    """The calibrated pin.Model, its loops closed by Pinocchio, at the commanded drives."""
+    calibration = sweep["lengths"]
+    machine = calibration.robot.with_errors(calibration.errors)
+    points = np.array([[0.0, 0.0, 0.0], [0.04, -0.05, 0.03]])
+    accuracy = assess_tool(calibration, Workspace.even(points))
+    drives = np.array([inverse(p, length=0.31025) for p in points])
+    for i, d in enumerate(drives):
+        tool = place(machine, d, "tcp", start=nominal_closure(machine).close(d))
+        assert accuracy.deviation[i] == pytest.approx(tool - points[i], abs=1e-9)
 
 
 def test_the_tool_of_a_calibration_is_placed_once(sweep):
@@ -340,15 +364,6 @@ def test_the_uncertainty_is_unknown_without_a_noise(experiment_2):
     rows = [experiment_2.readings[i] for i in (2, 0, 4)]
     session = experiment_2.select(rows).with_gauge(replace(experiment_2.gauge, sigma=None))
     assert assess_tool(identified(session)).after is None
-
-
-def test_machines_within_their_tolerances_have_no_other_scale():
-    plan = plan_of("raw-cycles")
-    plan = plan.with_gauge(replace(plan.gauge, range=None))
-    for seed in range(8):
-        errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=seed)
-        session = simulate_session(plan, errors, seed=seed).session
-        assert find_tolerance_scale(session).factor == 1.0, seed
 
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e-4, 3e-4])
