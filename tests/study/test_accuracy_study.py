@@ -11,7 +11,7 @@ from gauges import exact
 from machines import place
 from tolerances import TRUTH_BACK
 
-from orthocal import Choice
+from orthocal import Choice, load_robot
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, gauss_box
@@ -36,14 +36,33 @@ def summary(study):
 
 
 @pytest.mark.slow
-def test_tool_error_agrees_with_the_covariance(workshop):
-    """All errors are random, all are identified, gauges have mounting errors."""
-    result = summary(build_accuracy_study(workshop, Choice("full", tolerances=NEAR), machines=150))
+@pytest.mark.parametrize(("name", "model"), [("workshop", "full"), ("raw-cycles", "offsets")])
+def test_tool_error_agrees_with_the_covariance(name, model):
+    """All errors are random, all or offsets are identified, gauges have mounting errors."""
+    result = summary(
+        build_accuracy_study(plan_of(name), Choice(model, tolerances=NEAR), machines=150)
+    )
     assert result.machines > 145
     assert abs(result.after - result.predicted.reported.rms) < 3.0 * result.standard_error
     assert result.standard_error < 0.05 * result.after
     for e in result.parameters:
         assert abs(e.rms - e.predicted) < 4.5 * e.standard_error + 0.02 * e.predicted
+
+
+def test_standard_errors_of_the_papers_plan():
+    """1.942 σ of a single reading, computed independently: twelve differences, weighted."""
+    robot = load_robot("orthoglide")
+    plan = build_paper_plan(robot, Displacements(), Gauge(SIGMA, None, None))
+    choice = Choice("offsets", tolerances={"*.offset_mm": 0.1})
+    study = build_accuracy_study(plan, choice, drawn=["*.offset"], machines=1000)
+    prepared = study.prepare()  # without the tool errors of `run_study`
+    measured = prepared.measure(range(1000))
+    theta, converged = prepared.model.estimate(measured.values)
+    assert converged.all()
+    errors = theta - prepared.model.identified_part(measured.errors, prepared.error_names)
+    spread = np.sqrt((errors**2).mean(axis=0)) / SIGMA
+    standard_error = 1.942 / np.sqrt(2.0 * 1000)
+    assert np.abs(spread - 1.942).max() < 3.0 * standard_error + 0.0005
 
 
 def test_estimates_without_noise_equal_the_truth(orthoglide):
