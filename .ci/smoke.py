@@ -61,8 +61,9 @@ def run_lane(python: Path, *, resolution: str) -> str:
         tools = ["pytest>=8.0", "pytest-timeout>=2.3"]
         run([*install, "--editable", ROOT, *tools])
         cache = {**os.environ, "ORTHOCAL_CACHE": str(Path(directory) / "cache")}
+        # beside the whole suite, with lower priority, a test may wait as long as the suite takes;
         # Python shows no user the deprecations within libraries
-        options = ["-q", "-p", "no:cacheprovider", "-W", "ignore::DeprecationWarning"]
+        options = "-q --timeout=1800 -p no:cacheprovider -W ignore::DeprecationWarning".split()
         said = run([inside, "-m", "pytest", *options, *TESTS], env=cache)
     return f"{said}{python} with {resolution} versions: {time.monotonic() - began:.0f} s"
 
