@@ -68,7 +68,7 @@ MAX_POINTS = 4096
 
 
 class System:
-    """Equations r(x, p) = 0 of many postures, in metres: closures, then coordinates of the tool.
+    """Equations r(x, p) = 0 of many postures: closures, then coordinates of the tool, [m, rad].
 
     Args:
         robot: The robot.
@@ -84,6 +84,7 @@ class System:
         shortest: Use the shortest steps that close the loops, for robots with free motions. Their
             Jacobians are singular up to rounding, so that solving them does not give a useful step.
         units: Metres per unit of x, shape (n_x,).
+        row_units: Metres per unit of each row, shape (n_rows,).
         lower: Lower bounds of x, shape (n_x,).
         upper: Upper bounds of x, shape (n_x,).
         names: Joint of each x.
@@ -108,7 +109,7 @@ class System:
         self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot))
         names = coordinate_names(robot.model)
         self.names = tuple(names[k] for k in index.tolist())
-        self._row_units = np.append(closure_row_units(robot), np.ones(n_tool))
+        self.row_units = np.append(closure_row_units(robot), np.ones(n_tool))
         self._turns = np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_))
 
     def step(self, residuals: Array, jacobians: Array) -> Array:
@@ -128,10 +129,16 @@ class System:
         """Least-squares steps of minimum norm; NaN for Jacobians that are not finite."""
         steps = np.full((len(residuals), self.n_x), np.nan)  # no step: the caller drops the posture
         usable = np.isfinite(jacobians).all(axis=(1, 2))
-        inverse = np.linalg.pinv(jacobians[usable], rcond=RANK_TOLERANCE)
+        rows = jacobians[usable] * self.row_units[:, None]
+        inverse = np.linalg.pinv(rows, rcond=RANK_TOLERANCE)
+        weighted = residuals[usable] * self.row_units
         with np.errstate(over="ignore"):
-            steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
+            steps[usable] = -(inverse @ weighted[..., None])[..., 0]
         return steps
+
+    def scaled(self, jacobians: Array) -> Array:
+        """Jacobians with rows and columns in metres, shape (n, n_rows, n_x)."""
+        return np.asarray(jacobians * (self.row_units[:, None] / self.units))
 
     def regular_step(self, residuals: Array, jacobians: Array) -> tuple[Array, Mask]:
         """Newton steps, and a mask of the Jacobians that are certainly not singular.
@@ -145,8 +152,9 @@ class System:
             inverses = np.linalg.inv(jacobians)
         except np.linalg.LinAlgError:
             return self.step(residuals, jacobians), np.zeros(len(residuals), dtype=np.bool_)
-        norms = np.linalg.norm(jacobians / self.units, axis=(1, 2))
-        inverse_norms = np.linalg.norm(inverses * self.units[:, None], axis=(1, 2))
+        norms = np.linalg.norm(self.scaled(jacobians), axis=(1, 2))
+        scaled_inverses = inverses * (self.units[:, None] / self.row_units)
+        inverse_norms = np.linalg.norm(scaled_inverses, axis=(1, 2))
         steps = -(inverses @ residuals[..., None])[..., 0]
         return steps, np.asarray(norms * inverse_norms < SINGULAR_MARGIN / SINGULAR_BELOW)
 
@@ -162,7 +170,7 @@ class System:
     def describe(self, x: Array, p: Array, geometry: MachineGeometry) -> str:
         """Description of the openings of the loops in one posture."""
         residuals, _ = self.evaluate(x[None], self.prepare(p[None], geometry), geometry)
-        return describe_opening(residuals[0] / self._row_units, self._turns)
+        return describe_opening(residuals[0], self._turns)
 
 
 def solve_closures(
@@ -341,8 +349,8 @@ class _Path:
         """Refuse solutions with free motions, the most singular one first."""
         system, geometry = self._system, self._geometry.at(rows, len(self._points))
         prepared = system.prepare(self._targets[rows], geometry)
-        _, jacobians = system.evaluate(x[rows], prepared, geometry)
-        values = np.linalg.svd(jacobians / system.units, compute_uv=False)
+        scaled = system.scaled(system.evaluate(x[rows], prepared, geometry)[1])
+        values = np.linalg.svd(scaled, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
         ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), rows.shape)
@@ -374,7 +382,8 @@ class _Path:
         def evaluate(rows: NDArray[np.intp], x: Array) -> tuple[Array, Array, Array]:
             geometry = self._geometry.at(points[rows], len(self._points))
             residuals, jacobians = system.evaluate(x, prepared[rows], geometry)
-            return residuals, jacobians, np.abs(residuals).max(axis=1, initial=0.0)
+            largest = np.abs(residuals * system.row_units).max(axis=1, initial=0.0)
+            return residuals, jacobians, largest
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
         active = np.flatnonzero(worst >= tolerance)

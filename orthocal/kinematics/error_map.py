@@ -39,7 +39,7 @@ from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.se3 import exp6, right_jacobian
-from orthocal.kinematics.symbolic import Pose, nominal_placement
+from orthocal.kinematics.symbolic import Pose, moved_frames, nominal_placement
 from orthocal.robot.frames import Placement
 from orthocal.robot.model import Robot
 
@@ -171,7 +171,8 @@ class ErrorMap:
         self.twists = ca.Function("twists", [conditions, errors], outputs)
         self._twists = _Twists(self.twists)
         self.varying = np.unique(self._twists.general // 6)
-        nominal = [nominal_placement(robot.model, p) for p in self.moved]
+        frames = moved_frames(self.moved)
+        nominal = [nominal_placement(robot.model, p, frames) for p in self.moved]
         self._rotations = np.array([p.rotation for p in nominal]).reshape(-1, 3, 3)
         self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
 

@@ -26,10 +26,11 @@ from orthocal.kinematics.symbolic import (
     Pose,
     SymbolicTree,
     closure_residual,
+    moved_frames,
     nominal_placement,
 )
 from orthocal.robot.frames import Placement, carriers
-from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
+from orthocal.robot.model import Closure, Robot, joint_axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,24 +122,43 @@ class RobotFunctions:
         """Digest of all that the expressions depend on; robots with equal digests share functions.
 
         Moved placements are inputs of the functions, so that their nominal values do not count.
+        Machines of one kind share functions, whatever their dimensions, if effects move the frames
+        of their closures, legs and tool.
         """
         robot, model = self.robot, self.robot.model
-        n_joints, moved = model.njoints, set(self.errors.moved)
-        placements = [Placement(i, False) for i in range(1, n_joints)]
-        placements += [Placement(i, True) for i in range(model.nframes)]
-        fixed = [p for p in placements if p not in moved]
+        joints, moved = range(1, model.njoints), set(self.errors.moved)
+        ends = {robot.frame_id(name) for c in robot.closures for name in (c.frame_a, c.frame_b)}
+        tool = () if robot.tcp is None else (robot.frame_id(robot.tcp.frame),)
         parts: list[object] = [
             [(j.shortname(), j.idx_v, j.nv) for j in model.joints],
-            [joint_axis(model, i).tolist() for i in range(1, n_joints) if model.joints[i].nv == 1],
+            [joint_axis(model, i).tolist() for i in joints if model.joints[i].nv == 1],
             list(model.parents),
             [(f.name, f.parentJoint, f.parentFrame) for f in model.frames],
-            [(p, nominal_placement(model, p).homogeneous.tolist()) for p in fixed],
+            self._fixed([p for i in joints if (p := Placement(i, False)) not in moved]),
+            self.fixed_frames([*sorted(ends), *tool]),
             (self.errors.moved, self.errors.in_reference),
-            (robot.closures, closure_row_units(robot).tolist(), robot.tcp and robot.tcp.frame),
+            (robot.closures, robot.tcp and robot.tcp.frame),
             (robot.drive_index.tolist(), robot.passive_index.tolist()),
-            robot.reference_passive.tolist(),
         ]
         return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()
+
+    def fixed_frames(self, frames: Sequence[int]) -> str:
+        """Placements of those of some frames that have no error, in words."""
+        moved = moved_frames(self.errors.moved)
+        return self._fixed([Placement(f, True) for f in frames if f not in moved])
+
+    def fixed_passive(self, frames: Sequence[int]) -> str:
+        """Reference values of the passive coordinates that move some frames, in words."""
+        joints = (self.robot.model.joints[j] for f in frames for j in self.tree.joints_to(f))
+        moving = {k for joint in joints for k in range(joint.idx_v, joint.idx_v + joint.nv)}
+        coordinates = zip(self.robot.passive_index, self.robot.reference_passive, strict=True)
+        return repr([(int(k), float(value)) for k, value in coordinates if k in moving])
+
+    def _fixed(self, placements: Sequence[Placement]) -> str:
+        """Values of placements without errors, in words."""
+        model, moved = self.robot.model, moved_frames(self.errors.moved)
+        values = (nominal_placement(model, p, moved).homogeneous.tolist() for p in placements)
+        return repr(list(zip(placements, values, strict=True)))
 
     @property
     def n_twists(self) -> int:
@@ -149,18 +169,17 @@ class RobotFunctions:
 
     @cached_property
     def closure(self) -> ca.SX:
-        """Residual g of all closures, shape (closure_rows,), [m]: rotations scaled to lengths."""
-        return closure_residual(self.robot, self.tree) * closure_row_units(self.robot)
+        """Residual g of all closures, shape (closure_rows,), [m, rad]."""
+        return closure_residual(self.robot, self.tree)
 
     @cached_property
     def _closure_derivatives(self) -> tuple[ca.SX, ca.SX]:
         """∂g/∂q, shape (closure_rows, nv), and ∂g/∂ξ, shape (closure_rows, n_twists)."""
         blocks = [self._closure_blocks(closure) for closure in self.robot.closures]
-        scale = ca.diag(ca.SX(closure_row_units(self.robot)))
         nv = self.robot.model.nv
         by_joints = ca.vertcat(ca.SX(0, nv), *(joints for joints, _ in blocks))
         by_twists = ca.vertcat(ca.SX(0, self.n_twists), *(twists for _, twists in blocks))
-        return ca.sparsify(scale @ by_joints), ca.sparsify(scale @ by_twists)
+        return ca.sparsify(by_joints), ca.sparsify(by_twists)
 
     @cached_property
     def closure_by_passive(self) -> BatchFunction:
@@ -227,7 +246,9 @@ class RobotFunctions:
         name = f"{kind}_{index}"
         if name not in self._frame_functions:
             pose = self.tree.frame_pose
-            self._frame_functions[name] = self._batch(name, lambda: [express(pose(index))])
+            self._frame_functions[name] = self._batch(
+                name, lambda: [express(pose(index))], digest=self.fixed_frames([index])
+            )
         return self._frame_functions[name]
 
     @cached_property
@@ -341,17 +362,23 @@ class RobotFunctions:
         *,
         matrices: tuple[int, ...] = (),
         sparse: tuple[int, ...] = (),
+        digest: str = "",
     ) -> BatchFunction:
         """Batch function of the symbols; `matrices` and `sparse` are indices of outputs."""
         return BatchFunction(
-            lambda: self._function(name, outputs, sparse=sparse),
+            lambda: self._function(name, outputs, sparse=sparse, digest=digest),
             matrices=[f"y{i}" for i in matrices],
             sparse=[f"y{i}" for i in sparse],
-            key=function_key(name, self.digest),
+            key=function_key(name, self.digest, digest),
         )
 
     def _function(
-        self, name: str, outputs: Callable[[], list[ca.SX]], *, sparse: tuple[int, ...]
+        self,
+        name: str,
+        outputs: Callable[[], list[ca.SX]],
+        *,
+        sparse: tuple[int, ...],
+        digest: str = "",
     ) -> ca.Function:
         """Cached function of the symbols; `outputs` is called only if it is not cached."""
 
@@ -361,7 +388,7 @@ class RobotFunctions:
             labels = [f"y{i}" for i in range(len(values))]
             return ca.Function(name, self.symbols, values, inputs, labels)
 
-        return cached_function(function_key(name, self.digest), build)
+        return cached_function(function_key(name, self.digest, digest), build)
 
 
 @cached_per_robot(maxsize=8)

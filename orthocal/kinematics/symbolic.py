@@ -8,7 +8,7 @@ at zero errors and at closed loops (see `se3`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -20,7 +20,7 @@ from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import Condition, Placement
 from orthocal.errors import RobotError
 from orthocal.kinematics.se3 import exp6, log6
-from orthocal.robot.frames import parent_frame
+from orthocal.robot.frames import nearest_carrier
 from orthocal.robot.model import Robot, joint_axis
 
 
@@ -98,8 +98,8 @@ class SymbolicTree:
         coordinates: Joint coordinates, shape (nv,); one angle per unbounded revolute joint.
         joint_placements: Indices of joints, mapped to their placements in the moving frames of
             their parents; those of the model by default.
-        frame_placements: Indices of frames, mapped to their placements in the frames that carry
-            them (see `parent_frame`); those of the model by default.
+        frame_placements: Indices of frames, mapped to their placements (see `nominal_placement`);
+            those of the model by default.
     """
 
     def __init__(
@@ -139,14 +139,16 @@ class SymbolicTree:
     def frame_pose(self, frame: int) -> Pose:
         """World pose of a frame, with the errors of the frames that carry it."""
         if frame not in self._frames:
-            parent = parent_frame(self.model, frame)
-            placement = self._frame_placements.get(frame)
+            placed = self._frame_placements
+            carrier = nearest_carrier(self.model, frame, placed)
+            placement = placed.get(frame)
             if placement is None:
-                placement = constant_pose(nominal_placement(self.model, Placement(frame, True)))
-            if parent is None:
+                nominal = nominal_placement(self.model, Placement(frame, True), placed)
+                placement = constant_pose(nominal)
+            if carrier is None:
                 pose = self.joint_pose(self.model.frames[frame].parentJoint) * placement
             else:
-                pose = self.frame_pose(parent) * placement
+                pose = self.frame_pose(carrier) * placement
             self._frames[frame] = pose
         return self._frames[frame]
 
@@ -159,12 +161,24 @@ class SymbolicTree:
         return joints
 
 
-def nominal_placement(model: pin.Model, placement: Placement) -> pin.SE3:
-    """Nominal placement of a joint, or of a frame in the frame or joint that carries it."""
+def nominal_placement(model: pin.Model, placement: Placement, moved: Container[int]) -> pin.SE3:
+    """Nominal placement of a joint, or of a frame in the nearest moved frame or joint.
+
+    Args:
+        model: The nominal model.
+        placement: The placement.
+        moved: Indices of the frames with errors.
+    """
     if not placement.of_frame:
         return model.jointPlacements[placement.index]
-    parent, nominal = parent_frame(model, placement.index), model.frames[placement.index].placement
-    return nominal if parent is None else model.frames[parent].placement.inverse() * nominal
+    carrier = nearest_carrier(model, placement.index, moved)
+    nominal = model.frames[placement.index].placement
+    return nominal if carrier is None else model.frames[carrier].placement.inverse() * nominal
+
+
+def moved_frames(moved: Iterable[Placement]) -> frozenset[int]:
+    """Indices of the frames among moved placements."""
+    return frozenset(p.index for p in moved if p.of_frame)
 
 
 class SymbolicRobot:
@@ -234,9 +248,10 @@ def erroneous_placements(
     """Placements · exp6(δ) of the joints and of the frames with errors, by index."""
     joints: dict[int, Pose] = {}
     frames: dict[int, Pose] = {}
-    for placement, twist in twists.items():
-        if ca.sparsify(twist).nnz():
-            nominal = constant_pose(nominal_placement(model, placement))
-            poses = frames if placement.of_frame else joints
-            poses[placement.index] = nominal * Pose(*exp6(twist))
+    nonzero = {p: twist for p, twist in twists.items() if ca.sparsify(twist).nnz()}
+    moved = moved_frames(nonzero)
+    for placement, twist in nonzero.items():
+        nominal = constant_pose(nominal_placement(model, placement, moved))
+        poses = frames if placement.of_frame else joints
+        poses[placement.index] = nominal * Pose(*exp6(twist))
     return joints, frames

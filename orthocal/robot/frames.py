@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 
 import pinocchio as pin
@@ -13,7 +13,7 @@ from orthocal.errors import RobotError
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Placement of a joint or frame in the joint or frame that carries it."""
+    """Placement of a joint in its parent, or of a frame in the frame or joint that carries it."""
 
     index: int
     """Index of the joint or frame in the robot's model."""
@@ -48,6 +48,11 @@ def carriers(model: pin.Model, frame: int) -> Iterator[int]:
     while current is not None:
         yield current
         current = parent_frame(model, current)
+
+
+def nearest_carrier(model: pin.Model, frame: int, frames: Container[int]) -> int | None:
+    """Nearest of some frames that carries a frame on the same joint; None if none does."""
+    return next((f for f in carriers(model, frame) if f != frame and f in frames), None)
 
 
 def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:

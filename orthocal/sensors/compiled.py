@@ -133,7 +133,11 @@ class _Pattern:
         declared = repr([(type(e), self.robot.declared.effects.get(e.name)) for e in effects])
         foreign = any(source_digest(kind) for kind in kinds)
         whole = (fingerprint(self.robot),) if foreign else ()
-        return (robot_functions(self.robot).digest, declared, *whole)
+        functions, names = robot_functions(self.robot), self.frames
+        at_zero = [self.robot.frame_id(f) for f in names.at_zero]
+        others = [self.robot.frame_id(f) for f in (*names.in_posture, *names.in_second)]
+        frames = functions.fixed_frames([*at_zero, *others]), functions.fixed_passive(at_zero)
+        return (functions.digest, *frames, declared, *whole)
 
     @cached_property
     def expressions(self) -> tuple[list[ca.SX], list[ca.SX]]:

@@ -18,7 +18,12 @@ from orthocal.builder.biglide import Biglide
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.builder.machine_file import KINDS
 from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthoglide
+from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.planning.candidates import list_candidates
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.first_plan import first_equipment
 from orthocal.robot.loading import packaged_robots
 from orthocal.units import DEG
 
@@ -53,6 +58,34 @@ def test_slides_of_a_delta_are_at_the_heights_of_the_textbook(tmp_path, angles):
         apart = ((tower - POINTS[:, :2]) ** 2).sum(axis=1)
         height = POINTS[:, 2] + np.sqrt(delta.rod**2 - apart)
         assert np.abs(drives[:, k] - height).max() < CLOSED
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (Orthoglide(), Orthoglide(leg=0.25, attachment=0.03, rods_apart=0.06)),
+        (InclinedOrthoglide(), InclinedOrthoglide(leg=0.25, elevation=30 * DEG)),
+        (LinearDelta(), LinearDelta(rod=0.25, angles=tuple(a * DEG for a in (212, 329, 91)))),
+        (Biglide(), Biglide(leg=0.25, attachment=0.02)),
+    ],
+)
+def test_machines_of_one_kind_share_all_functions(tmp_path, monkeypatch, one, other):
+    """Those of the loops, the tool and the readings, whatever the dimensions."""
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
+
+    def build(machine, name):
+        robot = written(tmp_path, machine, name)
+        LoopClosure(robot).inverse(0.1 * POINTS)
+        ToolSensitivity(robot, free=robot.parameters.names)(robot.drive_zero)
+        equipment = Equipment(along=2, across=0.0, sections=(0.5,))
+        session = list_candidates(robot, first_equipment(robot, equipment))
+        problem = build_problem(session, model="full")
+        readings, _ = problem.predict_and_jacobian(np.zeros(problem.n_free))
+        assert np.isfinite(readings).all()
+        return {p.name for p in (tmp_path / "cache").iterdir()}
+
+    first = build(one, "one")
+    assert len(build(other, "other") - first) == 1  # the validation of the URDF
 
 
 def slide_directions(machine):

@@ -89,7 +89,12 @@ class SymbolicProblem:
         )
         by_theta = shared.chain(g_t, g_a, self.command)
         jacobian = ca.horzcat(by_theta, g_q @ ca.diag(ca.SX(scale)))
-        return g / LENGTH_SCALE, jacobian / LENGTH_SCALE
+        return self._row_scale * g, ca.diag(self._row_scale) @ jacobian
+
+    @cached_property
+    def _row_scale(self) -> ca.SX:
+        """Scale of the closure rows, shape (closure_rows,), [1/m, 1/rad]."""
+        return ca.SX(closure_row_units(self.problem.robot) / LENGTH_SCALE)
 
     @cached_property
     def readings(self) -> tuple[ReadingExpressions, ...]:
@@ -150,8 +155,7 @@ class SymbolicProblem:
     @cached_property
     def direct_closure(self) -> ca.SX:
         """ĝ of one posture, shape (closure_rows,)."""
-        scale = closure_row_units(self.problem.robot) / LENGTH_SCALE
-        return self._machines[0].closure_residual() * scale
+        return self._machines[0].closure_residual() * self._row_scale
 
     def direct_reading(self, expressions: ReadingExpressions) -> ca.SX:
         """Reading h, [m]."""
