@@ -249,7 +249,7 @@ def _too_small(session: Session, fit: Fit) -> Finding | None:
     if not step:
         return None
     observations = fit.problem.observations
-    parameters_used = observations.size - observations.n_zeros - noise.residual_dof
+    parameters_used = observations.size - observations.n_free_zeros - noise.residual_dof
     # repeated readings may have the same rounding error: each counts once
     dof = fit.independent_readings - parameters_used
     rounding_std = step / math.sqrt(12.0)

@@ -165,7 +165,7 @@ def _score(
         residual = project_out_zeros(problem.values - problem.predict(theta), observations)
     except ClosureError:  # the linearised machine cannot reach a posture
         residual = np.full(observations.size, np.nan)
-    count = observations.size - observations.n_zeros
+    count = observations.size - observations.n_free_zeros
     sum_of_squares = float(residual @ residual)
     rows = observations.rows(residual)
     k = effective + 1.0  # with the noise

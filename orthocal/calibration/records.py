@@ -181,7 +181,7 @@ class ParameterEstimate(InUnit):
     scaled: bool
     """True if the tolerance scale multiplies its prior standard deviation."""
     free: bool
-    identifiable: bool
+    resolvable: bool
     """True if the readings alone determine it better than its prior."""
     start: Number
     """Value at which the readings were linearised: the active one in the controller, [unit]."""

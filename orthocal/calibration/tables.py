@@ -43,7 +43,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
                     "high": finite_or_none(high),
                     "prior_std": p.prior_std,
                     "free": p.free,
-                    "identifiable": p.identifiable,
+                    "resolvable": p.resolvable,
                     "at_bound": p.at_bound,
                 }
             )

@@ -90,7 +90,7 @@ class LinearModel:
         self.sigma = float(sigmas[gauges[0].entries][0])
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.problem = problem.with_noise_ratio(sigmas / self.sigma)
-        self.dof = o.size - o.n_zeros
+        self.dof = o.size - o.n_free_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self.reference = self.problem.active_theta.copy()
         """Free parameters of the reference, shape (n_free,), [SI]: the controller corrects its

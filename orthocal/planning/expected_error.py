@@ -302,7 +302,7 @@ class ToolForecast:
             return None, 1.0
         possible = np.asarray(np.isfinite(jacobian).all(axis=1))
         lost = 1.0 - float(possible.mean())
-        if possible.sum() <= o.n_zeros:
+        if possible.sum() <= o.n_free_zeros:
             return None, lost
         o = o.only(possible)
         precision = np.maximum(problem.prior_precision, VAGUE)

@@ -152,6 +152,14 @@ def test_the_scores_of_table_1_solved_by_hand(table1):
     assert math.isinf(table1["full"].exact.aicc)
 
 
+def test_a_known_zero_takes_no_degree_of_freedom():
+    """That of a ball bar. One reading of the dial fixes its zero."""
+    session = session_of("linear_delta")
+    compared = compare_models(session, models=["offsets"])
+    (result,) = compared.results
+    assert result.exact.dof == pytest.approx(len(session.readings) - 1 - result.effective)
+
+
 def extend_to(problem, fit):
     """Parameters of a fit to fewer setups, 0 for the nuisance parameters of the others."""
     found = dict(zip(fit.problem.free, fit.solution.theta, strict=True))

@@ -79,7 +79,7 @@ def test_the_file_has_the_documented_keys(result):
         "prior_std",
         "scaled",
         "free",
-        "identifiable",
+        "resolvable",
     } <= set(document["parameters"][0])
     assert {
         "setup",

@@ -9,6 +9,9 @@ import yaml
 from orthocal import draw_errors, load_plan, simulate_session
 from orthocal.assessment.judgement import judge_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.families.unit_and_sign import factor_family
+from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.search import find_anomalies
 
 CIRCLES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
@@ -32,6 +35,20 @@ def with_bar(root, folder, example, planes):
         doc["setups"][f"bar_{plane}"] = bar
     (folder / "plan.yaml").write_text(yaml.safe_dump(doc))
     return load_plan(folder / "plan.yaml")
+
+
+def test_the_scale_of_readings_changes_their_density_in_each_free_direction(root, tmp_path):
+    """A free gauge zero takes one dimension from the readings of a setup, a known one none."""
+    plan = with_bar(root, tmp_path, "raw-cycles", ["xy"])
+    rows = Rows(plan, np.ones(len(plan.readings)))
+    dial = next(name for name in rows.setups if not name.startswith("bar"))
+    groups = [
+        Explanation("wrong unit", "setup", tuple(rows.setups[name].tolist()), (name,), factor=25.4)
+        for name in (dial, "bar_xy")
+    ]
+    family = factor_family(rows, groups)
+    expected = [len(rows.setups[dial]) - 1, len(rows.setups["bar_xy"])]
+    assert family.log_volume == pytest.approx(np.array(expected) * np.log(25.4))
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from calibrated import session_of
+from scipy.linalg import null_space
+from scipy.stats import multivariate_normal
 
 from orthocal import join_sessions
 from orthocal.hypotheses import linear_model as module
@@ -65,6 +67,24 @@ def test_a_machine_shift_changes_the_readings_of_its_sessions(model):
     without, found = model.linearise_all([plain, given], keep_jacobian=True)
     assert np.array_equal(found.jacobian[~later], without.jacobian[~later])
     assert np.abs(found.jacobian - without.jacobian)[later].max() > 1e-8
+
+
+@pytest.mark.parametrize("name", ["raw-cycles", "linear_delta"])
+def test_the_density_of_readings_is_that_of_their_contrasts(name):
+    """Against SciPy: each free gauge zero takes one dimension, a known one none."""
+    model = LinearModel(session_of(name))
+    o, at = model.problem.observations, model.at_reference(keep_jacobian=True)
+    free = model.problem.zero_incidence[:, ~o.zero_known]
+    contrasts = null_space(free.T).T if free.size else np.eye(o.size)
+    deviation = contrasts.T @ np.random.default_rng(2).normal(size=len(contrasts)) * model.sigma
+    scales = np.array([0.5, 1.0, 3.0])
+    rows = contrasts @ at.jacobian
+    covariances = (rows @ rows.T + (s * model.sigma) ** 2 * np.eye(len(contrasts)) for s in scales)
+    zero = np.zeros(len(contrasts))
+    expected = [multivariate_normal(zero, c).logpdf(contrasts @ deviation) for c in covariances]
+    products = at.likelihood.products(deviation[None])
+    (found,) = at.likelihood.log_densities(products, np.ones(1), scales)
+    assert np.diff(found) == pytest.approx(np.diff(expected))
 
 
 def test_the_model_of_the_same_rows_is_built_once(joined):

@@ -42,6 +42,8 @@ MAX_PAIRED_SETUPS = 24
 def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     """Hypotheses that all readings of a group have a wrong unit, decimal point or sign.
 
+    A cycle may have a wrong unit or decimal point only.
+
     Args:
         rows: The rows.
         sigma: Standard deviation of a reading, [m].
@@ -54,7 +56,8 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     if 3 < len(names) <= MAX_PAIRED_SETUPS:
         pairs = combinations(names, 2)
         yield factor_family(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
-    groups += [  # not the closing reading of a setup, and all its readings but this one
+    # not cycles of a single reading, such as the closing one, nor of all readings but one
+    groups += [
         _reversed("cycle", indices, names=(name,), cycle=cycle)
         for (name, cycle), indices in rows.cycles.items()
         if name in names and 1 < len(indices) < len(rows.setups[name]) - 1
@@ -140,7 +143,10 @@ def _scaled(
     factors: tuple[float, ...],
     sigma: float,
 ) -> Family:
-    """Family of groups multiplied by each factor after which the decimal step is plausible."""
+    """Family of groups multiplied by each factor after which the decimal step is plausible.
+
+    Factors below 1 are not tested: they make the step finer.
+    """
     of_rows = decimal_steps(rows.values)
     steps = [of_rows[list(g.rows)].min() for g in groups]
     explanations = [
@@ -153,11 +159,12 @@ def _scaled(
 
 
 def _dimensions(rows: Rows, group: Explanation) -> int:
-    """Number of independent readings in a group: its rows minus the gauge zeros of its setups."""
+    """Number of independent readings in a group: its rows minus the free zeros of its setups."""
     if not group.setups:
         return len(group.rows)
-    readings = rows.session.readings
-    return len(group.rows) - len({readings[i].setup for i in group.rows if rows.single[i]})
+    session = rows.session
+    setups = {session.readings[i].setup for i in group.rows if rows.single[i]}
+    return len(group.rows) - sum(session.setups[name].zero == "free" for name in setups)
 
 
 def decimal_steps(values: Array) -> Array:

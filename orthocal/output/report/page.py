@@ -5,6 +5,7 @@ The page is self-contained and needs no network.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
@@ -14,10 +15,12 @@ from rich.console import Group
 from orthocal.assessment.circular_deviation import find_circles
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration, require_calibration
+from orthocal.calibration.records import SessionRecord
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import require_suffix, write_file
 from orthocal.io.html import escape, heading, items, page, paragraph, table
 from orthocal.output.report.parameter_plots import (
+    MAX_IN_DETAIL,
     plot_correlations,
     plot_linearised,
     plot_parameters,
@@ -63,8 +66,8 @@ MAX_NAMED = 9
 """Largest number of parameters that the provenance lists."""
 
 GLOSSARY = (
-    "σ: standard deviation of one reading, from repeated cycles if possible, otherwise from the "
-    "residuals, otherwise as stated for the gauge.",
+    "σ: standard deviation of one reading, from repeated cycles if there are any. Residuals larger "
+    "than chance explains replace it, and the stated one is its lower limit.",
     "tolerance: limit of an error before the calibration; 19 of 20 errors are within it. From the "
     "robot's YAML or --tolerance.",
     "resolved: how much the readings improved a value: 0 % not at all, 100 % completely.",
@@ -79,9 +82,9 @@ GLOSSARY = (
     "uncertainty before calibration: RMS uncertainty of the tool position with every error within "
     "its tolerance. After calibration: with the readings. worst point: the largest value in the "
     "workspace.",
-    "combination: errors that the readings show only as a sum. It is identifiable if a change "
-    "within its tolerance changes the readings by more than their noise. Condition number and "
-    "observability indices O1 to O5 are measures of identifiability.",
+    "combination: errors that the readings show only as a sum. It is resolvable if half its "
+    "tolerance changes the readings by more than their noise. Condition number and observability "
+    "indices O1 to O5 are measures of identifiability.",
 )
 """Explanations of the report's terms."""
 
@@ -204,7 +207,7 @@ def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
 def _fit(calibration: Calibration) -> str:
     """Content of the section with the residuals."""
     parts = [to_markup(render_fit(calibration))]
-    if any(r.prediction_error == r.prediction_error for r in calibration.residuals):
+    if any(not math.isnan(r.prediction_error) for r in calibration.residuals):
         text = (
             "Predicted: readings of each setup, predicted from all other setups. A good model "
             "predicts them nearly as well as it fits them."
@@ -247,7 +250,7 @@ def _circles(calibration: Calibration) -> list[tuple[str, str, str]]:
 def _parameters(calibration: Calibration) -> str:
     """Content of the section with the parameters."""
     listed = to_markup(render_parameters(calibration, all_rows=True))
-    few = len(calibration.free) <= 12
+    few = len(calibration.free) <= MAX_IN_DETAIL
     return _figure(plot_parameters(calibration), "") + (
         listed if few else _details("All parameters", listed)
     )
@@ -285,7 +288,7 @@ def _correlations(calibration: Calibration) -> str:
 
 def _identifiability(calibration: Calibration) -> str:
     """Plot and tables of the identifiability."""
-    few = len(calibration.free) <= 12
+    few = len(calibration.free) <= MAX_IN_DETAIL
     tables = to_markup(render_identifiability(calibration, all_rows=True))
     return _figure(plot_singular_values(calibration), "") + (
         tables if few else _details("Tables", tables)
@@ -295,13 +298,6 @@ def _identifiability(calibration: Calibration) -> str:
 def _provenance(calibration: Calibration) -> str:
     """Table of robot, sessions, assumptions and software."""
     robot, session, solver = calibration.robot_record, calibration.session, calibration.solver
-    sigma = session.gauge_sigma
-    active = "not stated"
-    if session.controller_offsets is not None:
-        active = ", ".join(
-            f"{d.name} {signed(v * d.edge_factor)} {d.edge_unit}"
-            for d, v in zip(calibration.robot.drives, session.controller_offsets, strict=True)
-        )
     rows: list[tuple[str, str]] = [
         ("Robot", f"{robot.name} ({robot.reference})"),
         ("SHA-256 of the robot's files", robot.sha256),
@@ -313,10 +309,10 @@ def _provenance(calibration: Calibration) -> str:
                 ("Source", part.source or "not stated"),
                 ("File", part.path or "none"),
                 ("SHA-256 of the session's files", part.sha256 or "none"),
+                ("Offsets active during the measurement", _active_offsets(calibration, part)),
             )
         ),
-        ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma / MM)} mm per reading"),
-        ("Offsets active during the measurement", active),
+        *((f"Gauge {g.name}".rstrip(), _stated_sigma(g.sigma)) for g in calibration.gauges),
         (
             "Model",
             f"{calibration.model}: {len(calibration.free)} free parameters, "
@@ -333,6 +329,21 @@ def _provenance(calibration: Calibration) -> str:
     return table(("", ""), rows, left=2)
 
 
+def _active_offsets(calibration: Calibration, session: SessionRecord) -> str:
+    """Offsets of the controller during a session."""
+    if session.controller_offsets is None:
+        return "not stated"
+    return ", ".join(
+        f"{d.name} {signed(v * d.edge_factor)} {d.edge_unit}"
+        for d, v in zip(calibration.robot.drives, session.controller_offsets, strict=True)
+    )
+
+
+def _stated_sigma(sigma: float | None) -> str:
+    """Stated standard deviation of a reading of a gauge, [m]."""
+    return "σ not stated" if sigma is None else f"σ {plain(sigma / MM)} mm per reading"
+
+
 def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     """Tolerances, known values and bounds that the user stated."""
     defaults = calibration.robot.parameters.defaults
@@ -343,11 +354,14 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
         if not p.free:
             known_values.append(f"{p.name} {p.value * f:g} {unit}")
             continue
+        stated, default = (
+            show_limit(std) * f
+            for std in (p.prior_std / (factor if p.scaled else 1.0), defaults[p.name].prior_std)
+        )
         if p.prior and (p.mean != 0.0 or not calibration.prior):
             known_values.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.prior_std) * f:g} {unit}")
-        elif p.prior_std not in (defaults[p.name].prior_std, factor * defaults[p.name].prior_std):
-            limit, default = (show_limit(q.prior_std) * f for q in (p, defaults[p.name]))
-            tolerances.append(f"{p.name} {limit:g} {unit} instead of {default:g}")
+        elif not math.isclose(stated, default):
+            tolerances.append(f"{p.name} {stated:g} {unit} instead of {default:g}")
         if p.lower is not None or p.upper is not None:
             low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))
             bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))
@@ -361,7 +375,7 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
         if texts
     ]
     if factor != 1.0:
-        rows.append(("Tolerance scale", f"{factor:.2f}, all tolerances except those of offsets"))
+        rows.append(("Tolerance scale", f"{factor:.2f}, tolerances of legs, axes and drive scales"))
     return rows or [("Assumptions", "the tolerances of the robot")]
 
 

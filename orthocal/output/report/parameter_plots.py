@@ -74,7 +74,7 @@ def plot_linearised(calibration: Calibration) -> Figure | None:
     axes.hlines(y, 0.0, sizes, color="#888888", linewidth=0.8)
     axes.plot(sizes, y, label="exact − linearised", **AFTER_LOOK)
     axes.axvline(0.0, color="black", linewidth=0.8)
-    for sign, label in ((-1.0, "±0.1 σ: negligible"), (1.0, "")):
+    for sign, label in ((-1.0, f"±{NEGLIGIBLE:g} σ: negligible"), (1.0, "")):
         axes.axvline(sign * NEGLIGIBLE, color="black", linestyle=":", label=label)
     axes.set_xlabel("exact − linearised estimate, in σ of the parameter")
     draw_legend(figure, axes)
@@ -115,7 +115,7 @@ def plot_parameters(calibration: Calibration) -> Figure:
         axes.plot(values[bound], y[bound], label="at its bound", **BOUND_LOOK)
     if not finite.any() and not bound.all():
         axes.plot([], [], linestyle="none", label="no intervals: the noise is unknown")
-    axes.set_xlabel(f"estimate [{rows[0].edge_unit}]" if in_unit else "estimate [prior std]")
+    axes.set_xlabel(f"estimate [{rows[0].edge_unit}]" if in_unit else "estimate [tolerance]")
     draw_legend(figure, axes)
     if calibration.prior:
         _draw_shares(figure.axes[1], rows)

@@ -469,7 +469,7 @@ def test_many_parameters_are_in_tolerances_the_best_determined_first(sweep):
         title(figure)
         == "Estimates with 95 % intervals: 30 of 129, offsets, then the best determined"
     )
-    assert axes.get_xlabel() == "estimate [prior std]"
+    assert axes.get_xlabel() == "estimate [tolerance]"
     names = row_names(axes)
     assert len(names) == 30
     assert all(n.endswith(".offset") for n in names[:3])

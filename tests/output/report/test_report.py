@@ -9,7 +9,15 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from calibrated import EXPERIMENT_2, UNJUDGED, calibrated, rename_setups, report_of
+from calibrated import (
+    EXPERIMENT_2,
+    UNJUDGED,
+    calibrated,
+    identified,
+    rename_setups,
+    report_of,
+    session_of,
+)
 from conftest import marked_plots
 from rich.console import Group
 from rich.panel import Panel
@@ -125,7 +133,7 @@ def test_provenance_has_check_sums_of_files(calibration, page):
 
 def test_provenance_lists_stated_assumptions(root, read, calibration, page):
     assert _provenance(calibration) in page
-    assert ["Tolerance scale", "2.83, all tolerances except those of offsets"] in read.rows
+    assert ["Tolerance scale", "2.83, tolerances of legs, axes and drive scales"] in read.rows
     found = calibrate(
         root / "examples/raw-cycles",
         Choice(
@@ -141,6 +149,26 @@ def test_provenance_lists_stated_assumptions(root, read, calibration, page):
     assert ["Tolerances", "; ".join(offsets)] in rows
     assert ["Known values", "y_leg.length 0.05 ± 0.04 mm; x_leg.length 0.12 mm"] in rows
     assert ["Bounds", "z_slide.offset -1 … 2 mm"] in rows
+
+
+def test_stated_tolerances_are_those_before_their_scale(root):
+    scaled = calibrate(
+        root / "examples/table1/experiment-2",
+        Choice(model="lengths", tolerances={"x_leg.length_m": 0.4e-3}),
+    )
+    assert scaled.tolerance_scale.factor == pytest.approx(2.83, abs=0.005)
+    rows = Reader(_provenance(scaled)).rows
+    assert ["Tolerances", "x_leg.length 0.4 mm instead of 0.2"] in rows
+
+
+def test_sessions_have_their_own_offsets_and_gauges_their_own_scatter():
+    joined = identified([session_of("raw-cycles"), session_of("workshop")])
+    rows = Reader(_provenance(joined)).rows
+    offsets = [text for name, text in rows if name == "Offsets active during the measurement"]
+    assert len(offsets) == 2
+    assert [name for name, _ in rows if name.startswith("Gauge")] == [
+        f"Gauge {g.name}".rstrip() for g in joined.gauges
+    ]
 
 
 def test_plots_are_drawn_into_the_page(page, read):
