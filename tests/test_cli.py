@@ -180,7 +180,7 @@ def test_again_writes_the_same_plan_with_active_offsets(calibrated, experiment, 
 
 
 def test_offsets_are_changes_if_no_session_states_the_active_ones(experiment, tmp_path):
-    """Entered as complete offsets they would replace those of the controller."""
+    """Entered as total offsets they would replace those of the controller."""
     first = tmp_path / "first"
     shutil.copytree(experiment, first)
     text = (first / "session.yaml").read_text()

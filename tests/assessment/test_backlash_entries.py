@@ -98,7 +98,7 @@ def test_every_output_has_the_same_decision(calibration, plan):
     )
     text = to_text(render_answer(calibration, saved=Path("out")))
     rows = [r.split() for r in text.splitlines() if r.split()[:1] == ["z_slide"]]
-    assert rows[1][2:4] == ["none", "shown"]
+    assert rows[1][2] == "unchanged"
     assert "and this backlash" in text
 
 
@@ -182,7 +182,7 @@ def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     assert found.tool.without_backlash is None
     assert not is_worth_changing(second, found.backlash, None, None)
     text = to_text(render_answer(second, saved=Path("out")))
-    assert text.count(" stays ") == 2
+    assert text.count(" unchanged ") == 3
     assert "Next: nothing to enter" in text or "Next: correct" in text
 
 
@@ -214,7 +214,7 @@ def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
     judged = assess(validation.joint, **KNOWN)
     assert judged.keeps_offsets
     text = to_text(render_validation(validation))
-    assert "with this backlash" in text
+    assert "with the backlash from all readings" in text
     assert "Offsets from" not in text
     for e in judged.backlash:
         if e.change:
@@ -232,7 +232,7 @@ def test_a_small_backlash_stays_where_the_offsets_stay(plan):
     assert x.identified > expanded_uncertainty(found, x)
     assert (judged.keeps_offsets, x.enter) == (True, 0.0)
     assert "acklash" not in judged.decision.headline
-    assert re.search("x_slide +0.000 +stays ", to_text(render_answer(found, saved=Path("out"))))
+    assert re.search("x_slide +0.000 +unchanged ", to_text(render_answer(found, saved=Path("out"))))
 
 
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):

@@ -85,7 +85,7 @@ def test_scene_report_and_export_keep_them(entered):
     assert "Offsets to enter" not in shown
     report = build_report(kept)
     assert "Values to enter" not in report
-    assert "Enter the complete offset" not in report
+    assert "Enter the total offset" not in report
     with pytest.raises(ExportError, match="HOME_OFFSET does not change"):
         export_calibration(kept, "linuxcnc", options=ExportOptions(module=False))
 

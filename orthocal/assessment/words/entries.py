@@ -172,10 +172,10 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool, last: str = "") 
     """
     which = f"The last session, {last}," if last else "The session"
     if len(drives) == 1:
-        meaning = "The value is a change, not a complete offset"
+        meaning = "The value is a change, not a total offset"
         action = f"Add it to the active offset of {drives[0]}."
     else:
-        meaning = "The values are changes, not complete offsets"
+        meaning = "The values are changes, not total offsets"
         action = "Add each to the active offset of its drive."
     return note(
         "controller not stated",
@@ -239,19 +239,21 @@ def earlier_readings() -> Finding:
     )
 
 
-def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
+def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False, joint: bool = False) -> str:
     """Sentence about the expected tool error, the same in every output.
 
     Args:
         tool: The tool error.
         keep: Whether the active offsets are kept.
+        joint: Whether the values to enter are named as those from all readings.
     """
     backlash = tool.without_backlash is not None
     if keep and not backlash:
         return f"Expected tool error with the active offsets: {tool_mm(tool.now)} RMS."
-    entered = "this backlash" if keep else "these offsets"
-    if backlash and not keep:
-        entered += " and this backlash"
+    offsets, this, source = ("the", "", " from all readings") if joint else ("these", "this ", "")
+    named = [] if keep else [f"{offsets} offsets"]
+    named += [f"{'the ' if joint and keep else this}backlash"] if backlash else []
+    entered = " and ".join(named) + source
     return (
         f"Expected tool error with {entered}: {tool_mm(tool.entered)} RMS "
         f"(now {tool_mm(tool.now)})."

@@ -49,8 +49,8 @@ from orthocal.session.session import split_label
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS
 
-NONE_SHOWN = "none shown"
-"""Backlash that is not larger than its uncertainty, in words."""
+UNCHANGED = "unchanged"
+"""Backlash of the controller that keeps its value."""
 
 MOST_LISTED = 4
 """Further findings that the short answer lists."""
@@ -85,7 +85,7 @@ LONGEST_LINE = 150
 CONVERTED = "`orthocal export --offsets` converts it to HOME_OFFSET."
 """How an offset becomes a value of the controller."""
 
-NEW_NOTE = f"new: complete offset, in place of now. {CONVERTED}"
+NEW_NOTE = f"new: total offset, which replaces now. {CONVERTED}"
 """Meaning of the column `new` of offsets."""
 
 PRINT = "print. After a crash or a change of the printer probe again."
@@ -431,8 +431,8 @@ def render_values(calibration: Calibration) -> RenderableType:
 def render_backlash(calibration: Calibration) -> RenderableType:
     """Backlash for the controller to take up, drive by drive; a line if there is none to enter.
 
-    "None shown" is a backlash that is not larger than its uncertainty, "not determined" one that
-    readings do not limit.
+    "unchanged" and "not determined" keep the present value. Readings do not limit a backlash that
+    is not determined.
     """
     entries = assessment_of(calibration).backlash
     rows, halves, known, small = [], [], False, True
@@ -443,13 +443,15 @@ def render_backlash(calibration: Calibration) -> RenderableType:
         known |= is_known or bool(e.change)
         error = calibration[f"{e.drive}.backlash"]
         limited = error.std < DETERMINED * error.prior_std
-        unchanged = "stays" if is_known else NONE_SHOWN if limited else "not determined"
         small &= limited
-        enter = plain(e.enter * factor) if e.change else unchanged
+        keep = UNCHANGED if is_known or limited else "not determined"
+        enter = plain(e.enter * factor) if e.change else keep
         rows.append((e.drive, plain(e.active * factor), enter, half, e.edge_unit))
         halves.append(f"±{half} {e.edge_unit}")
     if not known:
-        return Text(f"Backlash: {NONE_SHOWN if small else 'not determined'} ({max(halves)}).")
+        return Text(
+            f"Backlash: {'not significant' if small else 'not determined'} ({max(halves)})."
+        )
     return table_of(("backlash", "now", "new", "±", "unit"), rows)
 
 

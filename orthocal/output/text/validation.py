@@ -10,6 +10,7 @@ from rich.text import Text
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.validation import Validation
 from orthocal.assessment.words.anomalies import describe_evidence
+from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
     CONVERTED,
@@ -68,8 +69,10 @@ def render_validation(
         for f in judged.findings
         if f.text not in judged.decision.reason and f.kind not in hidden
     ]
-    tool = [f.text for f in judged.of_kind("tool error")]
+    tool, final = [f.text for f in judged.of_kind("tool error")], assessment_of(answer)
     if judged.tool is not None and tool:
+        if final.entries:
+            tool = [describe_tool_error(judged.tool, keep=final.keeps_offsets, joint=True)]
         tool += describe_conditions(answer)
     parts: list[RenderableType] = [
         Text("Validation of a calibration", style="bold"),
@@ -83,11 +86,11 @@ def render_validation(
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
         table = table_of(("drive", "new", "unit"), rows)
-        note = f"new: complete offset. {CONVERTED}"
+        note = f"new: total offset. {CONVERTED}"
         parts.append(section("Values to enter", noted(table, note)))
     further = bool(judged.of_kind("further change"))
     backlash = judged.backlash
-    if validation.confirmed and assessment_of(answer).entries and (further or complete):
+    if validation.confirmed and final.entries and (further or complete):
         shown = [Text(), render_backlash(answer)] if backlash else []
         values = Group(entry_table(answer), *map(Text, describe_columns(answer)), *shown)
         parts.append(section("Offsets from all readings", values))
