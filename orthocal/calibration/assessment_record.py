@@ -56,6 +56,7 @@ FindingKind = Literal[
     # implausible readings and settings
     "wrong dimensions",
     "beyond tolerances",
+    "outstanding error",
     "above tolerances",
     "finer than the gauge",
     "residuals too small",

@@ -55,8 +55,8 @@ def export(
 
     --half-side-mm, --tool and --payload apply to a module for LinuxCNC.
 
-    Exit code 3: the verdict is not `enter`, or the machine does not reach the requested region or
-    tolerance. The reason is printed, and nothing is written.
+    Exit code 3: the verdict is not `enter`, or the machine does not reach the requested region,
+    or no module meets --within. The reason is printed, and nothing is written.
 
     Args:
         to (FORMAT): yaml: parameters with their units; table: corrections of the tool over a grid;
@@ -177,7 +177,7 @@ def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
 def _read_joints(
     path: Path, calibration: orthocal.Calibration, stated: Mapping[str, str | None]
 ) -> ControllerJoints:
-    """Joints of an INI file, with the compensation that the calibrated session states.
+    """Read the joints of an INI file; refuse a compensation that differs from the session's.
 
     Args:
         path: The INI file.

@@ -126,8 +126,8 @@ def plan(
     if assumed := describe_assumed_tip(chosen.equipment, chosen.session):
         put_note(assumed)
     if out is not None:
-        sessions = [Path(subject), out] if chosen.complements else [out]
-        stated = options.tolerance and chosen.complements
+        sessions = [Path(subject), out] if chosen.complements_session else [out]
+        stated = options.tolerance and chosen.complements_session
         tolerances = chosen.session.robot.parameters.stated if stated else {}
         with worker_budget(workers):
             _write(chosen, out, calibrate_command(sessions, tolerances, folder=out))

@@ -379,8 +379,10 @@ def _progress_lines(study: orthocal.Study) -> Callable[[Progress], None] | None:
     def report(progress: Progress) -> None:
         nonlocal next_share
         if progress.seconds_left is None:
-            if progress.kept:
-                put_note(f"orthocal: resume at {progress.kept} of {progress.total} {study.counted}")
+            if progress.resumed:
+                put_note(
+                    f"orthocal: resume at {progress.resumed} of {progress.total} {study.counted}"
+                )
             return
         share = progress.done / progress.total
         if share < min(next_share, 1.0):

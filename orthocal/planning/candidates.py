@@ -25,10 +25,11 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_reachable
-from orthocal.planning.expected_error import ENTERED_OFFSET_STD, is_offset
+from orthocal.planning.expected_error import ENTERED_OFFSET_STD
 from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.robot.model import Leg, Robot
+from orthocal.robot.parameters import is_offset
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip

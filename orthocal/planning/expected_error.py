@@ -35,6 +35,7 @@ from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE
 from orthocal.robot.model import Robot
+from orthocal.robot.parameters import is_offset
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
 from orthocal.statistics.information import VAGUE, Information
@@ -432,11 +433,6 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
     of_state = np.zeros((len(state), len(state)))
     of_state[np.ix_(places, places)] = marginal
     return of_state
-
-
-def is_offset(name: str) -> bool:
-    """True for the name of a drive's offset, which the controller corrects."""
-    return name.endswith(".offset")
 
 
 def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:

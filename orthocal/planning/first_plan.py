@@ -66,7 +66,7 @@ class FixedPlan:
     first_round: Expected
     effects: tuple[EffectLimits, ...]
     further: tuple[FurtherReadings, ...] = ()
-    complements: bool = False
+    complements_session: bool = False
 
     def find_sensor_gains(self) -> tuple[SensorGain, ...]:
         """Gains of an hour with each usual sensor, the largest first."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from types import NoneType
 
@@ -77,7 +77,7 @@ EXTRA_FOR_APPROACH = 2 / 3
 """Additional readings per setup if postures can be approached from either side."""
 
 SIMPLICITY_TOLERANCE = 3e-2
-"""Accepted relative increase of the error, in total, for tips on the crests of their rods."""
+"""Accepted relative increase of the error, in total, for tips nearer to their rods' crests."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,9 +96,9 @@ class MeasuringPlan:
     the complemented session has no active offsets, they are drawn from their priors."""
     first_round: Expected
     """Expected error after the plan, with offsets drawn from their priors."""
-    compared: tuple[Alternative, ...]
+    usual_plans: tuple[Alternative, ...]
     """Usual plans at equal cost."""
-    helps: tuple[Alternative, ...]
+    other_gauges: tuple[Alternative, ...]
     """This plan with other gauges."""
     stage: Stage
     """This plan as a point of the curve."""
@@ -107,24 +107,23 @@ class MeasuringPlan:
     equipment: Equipment
     candidates: int
     """Number of candidate readings."""
-    complements: bool
+    complements_session: bool
     """Whether the readings complement those of a session."""
-    effects: tuple[EffectLimits, ...] = ()
+    effects: tuple[EffectLimits, ...]
     """Limits of the effects beside geometry, before and after the plan."""
-    further: tuple[FurtherReadings, ...] = ()
+    further: tuple[FurtherReadings, ...]
     """Further readings for the effects that this plan does not determine."""
-    complete: Session | None = None
+    all_readings: Session
     """Planned readings with expected times and temperatures, joined with the existing readings."""
-    unusable: Mapping[str, float] = field(default_factory=dict)
+    unusable: Mapping[str, float]
     """Gauges that the plan cannot use, with the range to either side that they would need, [m]."""
-    unchosen: Mapping[str, float] = field(default_factory=dict)
+    unchosen: Mapping[str, float]
     """Stated gauges that could be used but are not in the plan, mapped to the range to either side
     that their readings need, [m]; to 0 if they are within their range."""
 
     def find_sensor_gains(self) -> tuple[SensorGain, ...]:
         """Gains of an hour with each usual sensor after these readings, the largest first."""
-        session = self.session if self.complete is None else self.complete
-        return find_sensor_gains(self.forecast, session, self.expected)
+        return find_sensor_gains(self.forecast, self.all_readings, self.expected)
 
     def find_remaining(self, *, count: int = 3) -> tuple[RemainingError, ...]:
         """Combinations of errors with the largest effect at the tool after these readings."""
@@ -147,7 +146,7 @@ class MeasuringPlan:
         """
         usual_plans = [
             (usual.expected.rms_by(self.criterion), usual.planned)
-            for usual in self.compared
+            for usual in self.usual_plans
             if usual.expected is not None
         ]
         error = self.expected.rms_by(self.criterion)
@@ -183,7 +182,7 @@ def plan_readings(
         choice: Parameters to identify, or a model; by default as `measured` states, or "full".
         setups: Number of setups; by default 6, or the number that `hours` allow.
         readings: Number of readings without the closing ones, at least 2 per setup. By default 3
-            per setup, with backlash 4 more in six setups, or the number that `hours` allow.
+            per setup, with backlash 2/3 more, or the number that `hours` allow.
         hours: Available time; excludes `setups` and `readings`.
         equipment: Available gauge, tip and region.
         measured: Existing readings, which the plan complements.
@@ -204,19 +203,20 @@ def plan_readings(
         TypeError: If an argument is of another kind.
     """
     _require_arguments(robot, measured, equipment, criterion, seed)
-    work = _SearchOptions(criterion, seed, starts, workers, report or (lambda text: None))
+    options = _SearchOptions(criterion, seed, starts, workers, report or (lambda text: None))
     measured = None if measured is None else state_noise(measured)
     chosen = resolve_choice(choice, measured, default_model=MODEL)
     robot, measured = _with_choice(robot, measured, chosen)
     equipment = equipment or Equipment()
     counts = _list_counts(setups, readings, hours, equipment, robot)
-    options: Sequence[list[int]] | float = counts
+    counts_or_minutes: Sequence[list[int]] | float = counts
     if equipment.owned and setups is None and readings is None:
-        options = HOUR * hours if hours is not None else equipment.minutes(*_totals(counts[0]))
+        minutes = equipment.minutes(*_totals(counts[0])) if hours is None else HOUR * hours
+        counts_or_minutes = minutes
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
     session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
-    return _plan(session, options, forecast, equipment, measured, work)
+    return _plan(session, counts_or_minutes, forecast, equipment, measured, options)
 
 
 def _require_arguments(
@@ -251,23 +251,24 @@ class _SearchOptions:
 
 def _plan(
     session: Session,
-    options: Sequence[list[int]] | float,
+    counts_or_minutes: Sequence[list[int]] | float,
     forecast: ToolForecast,
     equipment: Equipment,
     measured: Session | None,
-    work: _SearchOptions,
+    options: _SearchOptions,
 ) -> MeasuringPlan:
     """Plan with the smallest expected error.
 
     Args:
         session: All candidate readings.
-        options: Lists of the numbers of readings of each setup, or the available time, [min].
+        counts_or_minutes: Lists of the numbers of readings of each setup, or the available time,
+            [min].
         forecast: Expected errors of the robot.
         equipment: Gauge, tip and region.
         measured: Existing readings.
-        work: Criterion and options of the search.
+        options: Criterion and options of the search.
     """
-    work.report(f"computing {len(session.readings)} candidate readings")
+    options.report(f"computing {len(session.readings)} candidate readings")
     candidates = measure_candidates(
         session,
         forecast.problem(session),
@@ -277,65 +278,67 @@ def _plan(
     search = SetupSearch.of(
         candidates,
         forecast.prior_information(candidates.problem, candidates.state, measured),
-        forecast.weight_of(work.criterion, len(candidates.state)),
+        forecast.weight_of(options.criterion, len(candidates.state)),
     )
     timed = TimedSearch(search, equipment.durations(session), equipment.once)
-    planned = _search_setups(timed, candidates, options, work)
+    planned = _search_setups(timed, candidates, counts_or_minutes, options)
 
     def compare(planned: PlannedSetups) -> Comparison:
         plan = build_session(candidates, planned.setups, measured)
         return Comparison(candidates, plan, equipment, forecast, measured)
 
-    work.report("comparing the plan with others")
-    plan = _evaluate(timed, planned, compare(planned), work)
+    options.report("comparing the plan with others")
+    plan = _evaluate(timed, planned, compare(planned), options)
     better = min(plan.better_usual_plans, key=lambda usual: usual[0], default=None)
     if better is None:
         return plan
-    work.report("searching from a usual plan, because it is better")
+    options.report("searching from a usual plan, because it is better")
     error, setups = better
     improved = search.improve(setups)
     expected = compare(improved).expect_plan()
-    best = improved if is_less(expected.rms_by(work.criterion), error) else search.plan_of(setups)
-    return _evaluate(timed, best, compare(best), work)
+    best = (
+        improved if is_less(expected.rms_by(options.criterion), error) else search.plan_of(setups)
+    )
+    return _evaluate(timed, best, compare(best), options)
 
 
 def _search_setups(
     timed: TimedSearch,
     candidates: Candidates,
-    options: Sequence[list[int]] | float,
-    work: _SearchOptions,
+    counts_or_minutes: Sequence[list[int]] | float,
+    options: _SearchOptions,
 ) -> PlannedSetups:
     """Setups with the smallest error for a time, or one of the possible numbers of readings."""
     search = timed.search
 
     def report(start: int, _: float) -> None:
-        work.report(f"search {start} finished")
+        options.report(f"search {start} finished")
 
-    if isinstance(options, float):
-        work.report(f"choosing setups for {options:.0f} min")
+    if isinstance(counts_or_minutes, float):
+        options.report(f"choosing setups for {counts_or_minutes:.0f} min")
 
         def choose(weighted: SetupSearch) -> PlannedSetups:
             weighted_timed = replace(timed, search=weighted)
             return weighted_timed.choose(
-                options, starts=work.starts, workers=work.workers, report=report
+                counts_or_minutes, starts=options.starts, workers=options.workers, report=report
             )
     else:
-        counts, first = options[0], None
-        if len(options) > 1:
-            counts, first = _choose_counts(search, work.seed, work.workers, options)
-        work.report(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
+        counts, first = counts_or_minutes[0], None
+        if len(counts_or_minutes) > 1:
+            counts, first = _choose_counts(search, options.seed, options.workers, counts_or_minutes)
+        options.report(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
 
         def choose(weighted: SetupSearch) -> PlannedSetups:
             return weighted.choose(
                 counts,
-                seed=work.seed,
-                starts=work.starts,
-                workers=work.workers,
+                seed=options.seed,
+                starts=options.starts,
+                workers=options.workers,
                 report=report,
                 first=first if weighted is search else None,
             )
 
-    of_approach = _find_approach_parameters(candidates, candidates.session.robot)
+    of_approach = _find_approach_parameters(candidates)
     planned = _choose_setups(search, of_approach, choose)
     return _simplify(candidates, planned, search, of_approach)
 
@@ -372,11 +375,11 @@ def _find_unchosen(comparison: Comparison) -> dict[str, float]:
     return unchosen
 
 
-def _find_approach_parameters(candidates: Candidates, robot: Robot) -> list[int]:
+def _find_approach_parameters(candidates: Candidates) -> list[int]:
     """Indices in the state of the parameters of effects that depend on the approach."""
     names = {
         error.name
-        for effect in robot_effects(robot)
+        for effect in robot_effects(candidates.session.robot)
         if "approach" in effect.conditions
         for error in effect.errors
     }
@@ -419,7 +422,7 @@ def _evaluate(
     search: TimedSearch,
     planned: PlannedSetups,
     comparison: Comparison,
-    work: _SearchOptions,
+    options: _SearchOptions,
 ) -> MeasuringPlan:
     """Compute the expected errors of a plan and of its alternatives."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
@@ -427,44 +430,46 @@ def _evaluate(
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
     minutes = comparison.equipment.minutes_of(plan)
     each = None if comparison.equipment.owned else round(readings / setups)
-    with worker_budget(work.workers):
-        curve, helps, compared, expected, first_round, nominal, before, limits = call_in_parallel(
-            (
-                lambda: compute_curve(search, each, setups),
-                comparison.list_alternatives,
-                comparison.list_usual_plans,
-                comparison.expect_plan,
-                lambda: forecast.after(joined, entered=False),
-                lambda: forecast.about_nominal(joined),
-                lambda: (
-                    forecast.before
-                    if measured is None
-                    else forecast.after(measured, entered=comparison.entered)
+    with worker_budget(options.workers):
+        curve, other_gauges, usual_plans, expected, first_round, nominal, before, limits = (
+            call_in_parallel(
+                (
+                    lambda: compute_curve(search, each, setups),
+                    comparison.list_alternatives,
+                    comparison.list_usual_plans,
+                    comparison.expect_plan,
+                    lambda: forecast.after(joined, entered=False),
+                    lambda: forecast.about_nominal(joined),
+                    lambda: (
+                        forecast.before
+                        if measured is None
+                        else forecast.after(measured, entered=comparison.entered)
+                    ),
+                    lambda: find_limits(forecast.problem(joined), stated_sigma(joined.gauge)),
                 ),
-                lambda: find_limits(forecast.problem(joined), stated_sigma(joined.gauge)),
-            ),
-            killed=KILLED,
+                killed=KILLED,
+            )
         )
     stage = Stage(setups, readings, minutes, planned.error)  # without the closing readings
-    factor, constant = find_scale(stage.error, expected, nominal, work.criterion)
+    factor, constant = find_scale(stage.error, expected, nominal, options.criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
-        criterion=work.criterion,
+        criterion=options.criterion,
         minutes=minutes,
         before=before,
         expected=expected,
         first_round=first_round,
-        compared=compared,
-        helps=helps,
+        usual_plans=usual_plans,
+        other_gauges=other_gauges,
         stage=scale_curve([stage], factor, constant)[0],
         curve=scale_curve(curve, factor, constant),
         equipment=comparison.equipment,
         candidates=len(comparison.candidates.session.readings),
-        complements=measured is not None,
+        complements_session=measured is not None,
         effects=limits,
         further=find_further_readings(comparison, limits),
-        complete=joined,
+        all_readings=joined,
         unusable=comparison.candidates.unusable,
         unchosen=_find_unchosen(comparison),
     )
@@ -480,7 +485,10 @@ def _list_counts(
     """Possible lists of the numbers of readings of each setup; arguments as in `plan_readings`."""
     if hours is not None:
         if setups is not None or readings is not None:
-            raise ParameterError("found with --setups or --readings; expected one", where="--hours")
+            raise ParameterError(
+                "found together with --setups or --readings; state hours, or setups and readings",
+                where="--hours",
+            )
         options = []
         for each in READINGS_PER_SETUP:
             count = int(hours * HOUR / equipment.minutes(1, each + 1))

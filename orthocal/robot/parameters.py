@@ -540,6 +540,11 @@ def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
         )
 
 
+def is_offset(name: str) -> bool:
+    """True for the name of a drive's offset, which the controller corrects."""
+    return name.endswith(".offset")
+
+
 def suggest(name: str, names: Iterable[str]) -> str:
     """Hint with similar names, for messages."""
     close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)

@@ -193,8 +193,8 @@ def estimate_noise(
     """Noise of a reading: from repeated cycles, otherwise from residuals, otherwise as stated.
 
     Residuals replace cycles if an F test shows that they are too large. The model then has errors,
-    and standard deviations from the scatter of the cycles would be too small. The stated noise of
-    the gauge is a lower limit (`noise_floor`).
+    and standard deviations from the scatter of the cycles would be too small. Few residuals do not
+    replace the stated noise, which is always a lower limit (`noise_floor`).
 
     Args:
         repeatability: From `estimate_repeatability`.

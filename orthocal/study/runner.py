@@ -48,7 +48,7 @@ class Progress:
     """Number of finished cases."""
     total: int
     """Number of all cases."""
-    kept: int
+    resumed: int
     """Number of cases that earlier runs finished."""
     seconds_left: float | None
     """Expected remaining time, [s]; None before the first task of this run has finished."""
@@ -157,7 +157,7 @@ def _read_results(journal: Journal, study: Study) -> Results:
         if data is None:
             raise OrthocalError(
                 "is not a line of a study: the file is damaged, or another kind of file. "
-                "--force starts the study again",
+                "--force overwrites it",
                 where=where,
             )
         if first:

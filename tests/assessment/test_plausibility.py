@@ -49,7 +49,7 @@ def test_readings_in_inches_are_found(session):
     assert finer.text.startswith("All 54 readings appear to be in inches")
     coarse = session.with_values(np.round(session.values / 25.4, 6))  # no multiples in inches
     (finer,) = (f for f in find_implausible(coarse) if f.kind == "finer than the gauge")
-    assert "readings are in inches, or have more digits than the gauge shows" in finer.text
+    assert "readings have more digits, or are in inches" in finer.text
     assert "residuals too small" in kinds(inches)
     found = [f for f in judge_session(inches).findings if f.severity != "note"]
     assert [f.kind for f in found] == ["wrong unit"]
@@ -133,9 +133,12 @@ def test_legs_of_different_lengths_are_found(tmp_path):
     ("gauge", "number"),
     [
         ({"resolution": 10e-3, "range": (-0.4e-3, 0.4e-3)}, {"range_mm": 0.8}),
-        ({"resolution": 10e-3, "range": None}, {"finer": 49.0}),
-        ({"resolution": 0.5e-3}, {"finer": 51.0}),  # of ±5 mm, but 50 times the noise
-        ({"resolution": 0.5e-3, "sigma": None, "range": None}, {"finer": 51.0}),
+        ({"resolution": 10e-3, "range": None}, {"readings_between_steps": 49.0}),
+        (
+            {"resolution": 0.5e-3},
+            {"readings_between_steps": 51.0},
+        ),  # of ±5 mm, but 50 times the noise
+        ({"resolution": 0.5e-3, "sigma": None, "range": None}, {"readings_between_steps": 51.0}),
     ],
 )
 def test_an_impossible_resolution_is_the_only_finding(cycles, gauge, number):
@@ -175,7 +178,7 @@ def test_a_sigma_in_micrometres_is_found(cycles):
     """Computed readings without scatter do not contradict it."""
     coarse = cycles.with_gauge(replace(cycles.gauge, sigma=10e-3))
     (found,) = [d for d in find_implausible(coarse) if d.kind == "sigma too large"]
-    assert found.numbers["given_mm"] == pytest.approx(10.0)
+    assert found.numbers["gauge_sigma_mm"] == pytest.approx(10.0)
     assert "sigma too large" not in kinds(cycles)
     same = cycles.with_values(np.zeros(len(cycles.readings)))
     same = same.with_gauge(replace(same.gauge, sigma=10e-6, resolution=None))
@@ -223,6 +226,7 @@ def test_an_error_of_a_mounting_may_be_a_wrong_reading(name, advice):
     problem = build_problem(session_of("workshop"), model="offsets")
     (parameter,) = (p for p in problem.parameters if p.name == name)
     found = outstanding_error(parameter, 0.1)
+    assert found.kind == "outstanding error"
     assert found.severity == "reject"
     assert found.action.startswith(advice)
 

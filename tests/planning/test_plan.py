@@ -110,9 +110,9 @@ def test_setups_share_columns_and_parts_of_an_instrument_do_not():
 
 
 def test_no_usual_plan_is_better_at_equal_cost(planned):
-    names = [a.name for a in planned.compared]
+    names = [a.name for a in planned.usual_plans]
     assert names == ["the paper's", "even"]
-    for usual in planned.compared:
+    for usual in planned.usual_plans:
         assert usual.minutes == pytest.approx(planned.minutes)
         assert not is_less(usual.expected.reported.rms, planned.expected.reported.rms)
 
@@ -269,7 +269,7 @@ def test_a_plan_uses_the_available_hours(orthoglide):
         ({"setups": 3, "readings": 5}, "--readings: found 5; expected at least 6, 2 for each of 3"),
         ({"setups": 41}, "--setups: found 41; expected 1 to 40"),
         ({"hours": 0.1}, "--hours: found 0.1; expected at least 0.2"),
-        ({"hours": 1.0, "setups": 3}, "--hours: found with --setups or --readings"),
+        ({"hours": 1.0, "setups": 3}, "--hours: found together with --setups or --readings"),
         (
             {"readings": 600, "setups": 2, "equipment": Equipment(**QUICK)},
             "no setup can have 300 readings",
@@ -324,9 +324,12 @@ def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide
     equipment = Equipment(gauge=Gauge(5e-6, 10e-6, (-4e-4, 4e-4)), **FEW)
     choice = Choice("full", tolerances={"*.offset_mm": 0.4})
     plan = plan_readings(orthoglide, choice, equipment=equipment, starts=1)
-    assert [(a.name, a.expected) for a in plan.compared] == [("the paper's", None), ("even", None)]
+    assert [(a.name, a.expected) for a in plan.usual_plans] == [
+        ("the paper's", None),
+        ("even", None),
+    ]
     assert summarize(plan).count(OUT_OF_RANGE) == 2
-    compared = json.loads(plan_json(plan))["compared"]
+    compared = json.loads(plan_json(plan))["usual_plans"]
     assert [(a["in_range"], a["aligned_um"]) for a in compared] == [(False, None)] * 2
 
 
@@ -346,14 +349,14 @@ def test_a_usual_plan_that_is_better_is_preferred(orthoglide, monkeypatch):
     plan = plan_badly(orthoglide, monkeypatch, readings=readings)
     assert len(plan.session.readings) == readings + 2
     assert len({r.key for r in plan.session.readings}) == readings + 2
-    assert [a.readings for a in plan.compared] == [readings + 2] * 2
+    assert [a.readings for a in plan.usual_plans] == [readings + 2] * 2
     assert plan.better_usual_plans == []
-    assert plan.expected.reported.rms <= min(a.expected.reported.rms for a in plan.compared)
+    assert plan.expected.reported.rms <= min(a.expected.reported.rms for a in plan.usual_plans)
 
 
 def test_usual_plans_are_preferred_for_tool_errors_only(orthoglide, monkeypatch):
     plan = plan_badly(orthoglide, monkeypatch, readings=6, criterion="D")
-    assert plan.expected.reported.rms > min(a.expected.reported.rms for a in plan.compared)
+    assert plan.expected.reported.rms > min(a.expected.reported.rms for a in plan.usual_plans)
 
 
 def plan_badly(robot, monkeypatch, **options):

@@ -203,13 +203,13 @@ def test_a_plan_is_summarised(headline):
 
 
 def test_other_gauges_without_a_gain_are_not_listed(headline):
-    first, second, *_ = headline.helps
+    first, second, *_ = headline.other_gauges
     mirror = replace(first, name="a mirror", expected=headline.expected)
-    text = summarize(replace(headline, helps=(mirror,)))
+    text = summarize(replace(headline, other_gauges=(mirror,)))
     assert "a mirror: " not in text
     assert "None (a mirror) gains 2%" in text
     better = replace(second, expected=halve(headline.expected))
-    text = summarize(replace(headline, helps=(mirror, better)))
+    text = summarize(replace(headline, other_gauges=(mirror, better)))
     assert f"The same readings with {second.name}: " in text
     assert "mirror" not in text
 

@@ -432,7 +432,7 @@ def test_a_sensor_with_too_short_a_range_is_named(owned):
     assert " ".join(last.split()).startswith("Not in the plan: bar. Within the tolerances")
     assert " ".join(last.split()).endswith(f"{remedy}, use a gauge of more range {entering}")
     active = plan.session.with_controller([1e-3, 0.0, 0.0])  # offsets are entered already
-    (words,) = describe_absent(replace(plan, complements=True, session=active))
+    (words,) = describe_absent(replace(plan, complements_session=True, session=active))
     assert words.endswith(f"{remedy} or use a gauge of more range.")
 
 

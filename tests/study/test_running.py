@@ -91,7 +91,7 @@ def test_only_an_incomplete_line_is_computed_again(study, undisturbed, tmp_path,
     with monkeypatch.context() as patched:  # finished tasks are not computed again
         patched.setattr(running, "run_task", None)
         run_study(study, folder=tmp_path, report=told.append)
-    assert [(p.done, p.kept) for p in told] == [(12 * DRAWS, 12 * DRAWS)]
+    assert [(p.done, p.resumed) for p in told] == [(12 * DRAWS, 12 * DRAWS)]
     file = tmp_path / JOURNAL
     whole = file.read_bytes()
     for cut in (1, 100, len(whole.splitlines(keepends=True)[-1])):

@@ -83,9 +83,9 @@ def outstanding_error(parameter: Parameter, error: float) -> Finding:
             "may look the same. If the readings were right, state the true value or a larger "
         )
     return reject(
-        "beyond tolerances",
+        "outstanding error",
         f"One error explains these readings almost alone: {parameter.name} of about {error:+.3g} "
-        f"{unit}, where at most ±{tolerance:g} {unit} are stated.",
+        f"{unit}. Its tolerance is ±{tolerance:g} {unit}.",
         f"{action}tolerance.",
         parameter_places(parameter.name),
         **{f"error_{unit}": error, f"tolerance_{unit}": tolerance},
@@ -140,8 +140,8 @@ def finer_than_gauge(
     """
     first = f"The first is {value / MM:.6g} mm in {where}."
     text, action = (
-        f"{count} of {total} readings are in inches, or have more digits than the gauge"
-        f"{_named(name)} shows (resolution {step / MM:g} mm). {first}",
+        f"The gauge{_named(name)} shows steps of {step / MM:g} mm (resolution), but {count} of "
+        f"{total} readings have more digits, or are in inches. {first}",
         "Make sure that the readings are in mm, not in inches, and that the resolution is right"
         f"{', and that each setup names its gauge' if name else ''}.",
     )
@@ -156,7 +156,7 @@ def finer_than_gauge(
         text,
         action,
         places,
-        finer=float(count),
+        readings_between_steps=float(count),
         resolution_mm=step / MM,
     )
 
@@ -184,7 +184,7 @@ def coarser_than_readings(
         f"of {total} readings lie between such steps. The first is {value / MM:.6g} mm in {where}.",
         "Make sure that gauge.resolution_mm is right, and that the readings are in mm.",
         places,
-        finer=float(count),
+        readings_between_steps=float(count),
         resolution_mm=step / MM,
     )
 
@@ -236,7 +236,7 @@ def sigma_too_large(stated: float, *, scatter: float | None = None, step: float 
         f"The session states that a reading scatters by {stated / MM:g} mm (gauge.sigma_mm). "
         f"{shown}",
         "Make sure that gauge.sigma_mm is in mm.",
-        given_mm=stated / MM,
+        gauge_sigma_mm=stated / MM,
         **{"resolution_mm" if scatter is None else "scatter_mm": reference / MM},
         ratio=stated / reference,
     )

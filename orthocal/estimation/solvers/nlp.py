@@ -173,7 +173,7 @@ class ProgramFunctions:
     ) -> ca.MX:
         """Add the readings of one sensor group to gradient and Hessian; return their objective.
 
-        Local variables are (θ̂, ν̂, ẑ, q̂) in the order of x.
+        Local variables are (θ̂, ν̂, ẑ, q̂).
         """
         count, n_t = expressions.group.entries.size, expressions.theta_index.size
         theta = np.tile(expressions.theta_index, (count, 1))
@@ -194,7 +194,7 @@ class ProgramFunctions:
         hessian.add(expressions.theta_index[rows], expressions.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
         rows, columns = variables[:, rows], variables[:, columns]
-        # nuisance parameters that setups share may have any order
+        # the values of aligned ν̂ are last in x, and shared ν̂ may have any order
         upper = np.minimum(rows, columns), np.maximum(rows, columns)
         hessian.add(*upper, lam_f * ca.vec(separate))
         return total

@@ -29,6 +29,7 @@ from orthocal.output.report.figure import (
     shade,
 )
 from orthocal.output.text.layout import short_name, typeset
+from orthocal.robot.parameters import is_offset
 from orthocal.units import MM, show_limit
 
 MAX_IN_DETAIL = 12
@@ -240,4 +241,4 @@ def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, Paramet
 def _importance(parameter: ParameterEstimate) -> tuple[bool, float]:
     """Sort key: offsets first, then the best determined parameters."""
     share = parameter.data_share
-    return not parameter.name.endswith(".offset"), math.inf if math.isnan(share) else -share
+    return not is_offset(parameter.name), math.inf if math.isnan(share) else -share

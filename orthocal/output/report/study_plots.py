@@ -179,7 +179,7 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
     errors.append(plan.stage.error / unit)
     axes.plot(plan.minutes / HOUR, errors[-1], "s", color=AFTER, label="this plan")
     if plan.criterion == "aligned":
-        for marker, colour, other in zip("o^", (BEFORE, PREDICTED), plan.compared, strict=False):
+        for marker, colour, other in zip("o^", (BEFORE, PREDICTED), plan.usual_plans, strict=False):
             if other.expected is not None:
                 errors.append(other.expected.reported.rms / unit)
                 look: Look = {"color": colour, "label": other.name}

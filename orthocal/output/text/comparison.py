@@ -30,6 +30,7 @@ from orthocal.output.text.layout import (
     table_of,
     um,
 )
+from orthocal.robot.parameters import is_offset
 from orthocal.units import MM
 
 MORE = "--details prints scores, estimates and residuals of each model."
@@ -153,7 +154,7 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     names = list(dict.fromkeys(n for r in results for n in r.exact.estimates))
     small = [r for r in results if r.n_free <= 12]
     named = {n for r in small for n in r.exact.estimates}
-    shown = [n for n in names if all_rows or n in named or n.endswith(".offset")]
+    shown = [n for n in names if all_rows or n in named or is_offset(n)]
     parameters = results[0].calibration.robot.parameters
     half = {
         r.model: dict(

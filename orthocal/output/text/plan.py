@@ -156,7 +156,7 @@ def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
     first, workspace = plan.first_round, plan.forecast.workspace
     expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.before))
     figures = f"now {now}, {before} after this measurement, {expected} after a second one"
-    if plan.complements:
+    if plan.complements_session:
         figures = f"{expected} with these readings added, {now} with those of the session alone"
     lines = [
         f"Expected tool error with all identified errors corrected: {figures}.",
@@ -184,7 +184,7 @@ def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) 
 
 def describe_absent(plan: MeasuringPlan) -> list[str]:
     """Gauges that are not in the plan, and what to do, as sentences."""
-    entered = plan.complements and bool(np.any(plan.session.active_offsets))
+    entered = plan.complements_session and bool(np.any(plan.session.active_offsets))
     kinds = {sensor.name: sensor.keys["sensor"] for sensor in plan.equipment.owned}
     unusable = dict(zip(_unusable_names(plan), plan.unusable.values(), strict=True))
     sentences = []
@@ -336,8 +336,8 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "before": sizes(plan.before),
         "expected": sizes(plan.expected),
         "first_round": {**sizes(plan.first_round), "lost": plan.first_round.lost},
-        "compared": [alternative(a) for a in plan.compared],
-        "helps": [alternative(a) for a in plan.helps],
+        "usual_plans": [alternative(a) for a in plan.usual_plans],
+        "other_gauges": [alternative(a) for a in plan.other_gauges],
         "curve": [stage(s) for s in plan.curve],
         "enough": None if plan.enough is None else stage(plan.enough),
         "unusable_mm": {name: needed / MM for name, needed in plan.unusable.items()},
@@ -417,14 +417,14 @@ def _when_enough(plan: MeasuringPlan) -> str:
 
 def _second_measurement(plan: MeasuringPlan, prefix: str) -> str:
     """Measurement after which tool errors of a first plan are stated; "" for a complement."""
-    return "" if plan.complements else f"{prefix}a second measurement"
+    return "" if plan.complements_session else f"{prefix}a second measurement"
 
 
 def _alternatives(plan: MeasuringPlan) -> RenderableType:
     s = one_row_per_point(plan.session)
     this = Alternative("this plan", len(s.setups), len(s.readings), plan.minutes, plan.expected)
     rows = []
-    for a in (this, *plan.compared):
+    for a in (this, *plan.usual_plans):
         error = OUT_OF_RANGE if a.expected is None else show_um(a.expected)
         name = EVENLY if a.name == "even" else a.name
         rows.append((name, str(a.setups), str(a.readings), show_duration(a.minutes), error))
@@ -435,7 +435,7 @@ def _alternatives(plan: MeasuringPlan) -> RenderableType:
 def _helps(plan: MeasuringPlan, gains: Sequence[SensorGain]) -> list[str]:
     """Other gauges and sensors that reduce the error, the best first."""
     mine = plan.expected.reported.rms
-    sizes = {a.name: a.expected.reported.rms for a in plan.helps if a.expected is not None}
+    sizes = {a.name: a.expected.reported.rms for a in plan.other_gauges if a.expected is not None}
     names = sorted(sizes, key=sizes.__getitem__)
     better = [n for n in names if sizes[n] < (1.0 - NOTICEABLE) * mine]
     texts = [f"The same readings with {n}: {tool_mm(sizes[n])}." for n in better]

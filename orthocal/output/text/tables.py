@@ -30,6 +30,7 @@ from orthocal.output.text.layout import (
     signed,
     table_of,
 )
+from orthocal.robot.parameters import is_offset
 from orthocal.text import list_some
 from orthocal.units import MM, UM, show_limit
 
@@ -130,7 +131,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
 
 def _is_listed(p: ParameterEstimate) -> bool:
     return (
-        p.name.endswith(".offset")
+        is_offset(p.name)
         or p.at_bound is not None
         or p.interval is not None
         or not p.prior
