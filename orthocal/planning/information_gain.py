@@ -35,7 +35,7 @@ class Pairs:
     flat: Indices
     """Index of each pair in a flattened matrix of shape (m, m), shape (n_pairs,)."""
     within_range: Indices
-    """Number of readings within the gauge's range if it is aligned in each reading, shape (m,)."""
+    """Number of readings within the gauge's range if the setup begins in each reading, (m,)."""
 
     @staticmethod
     def of(setup: CandidateSetup) -> Pairs:
@@ -60,8 +60,8 @@ def pair_gains(product: Array, spread: Array, noise: float, *, absolute: bool) -
     With a free gauge zero only the difference of the readings counts.
 
     Args:
-        product: A C T C Aᵀ, shape (..., m, m); overwritten.
-        spread: V, shape (..., m, m), [m²]; overwritten.
+        product: A C T C Aᵀ, shape (..., m, m); overwritten with a free zero.
+        spread: V, shape (..., m, m), [m²]; overwritten with a free zero.
         noise: σ², [m²].
         absolute: Whether the gauge zero is known.
     """
@@ -231,7 +231,10 @@ class SetupGain:
                 gains[(i == row) | (j == row)] = -1.0
 
     def _aligned_gains(self) -> Array:
-        """Gains of the differences of all pairs, aligned in the first reading (row), (m, m)."""
+        """Gains of the differences of all pairs, aligned in the first reading (row), (m, m).
+
+        They are those of `gains`, in a fiftieth of its time.
+        """
         product, spread = self.effect @ self.effect.T, self.spread
         gains, spreads = (
             np.add.outer(s.diagonal(), s.diagonal()) - 2.0 * s for s in (product, spread)

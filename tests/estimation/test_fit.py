@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibrated import UNJUDGED, identified
@@ -9,13 +11,14 @@ from models import TRUTH
 from scipy.optimize import lsq_linear
 from tolerances import SAME_OPTIMUM
 
-from orthocal import Choice, SolverOptions, calibrate, simulate_session
+from orthocal import Choice, SolverOptions, calibrate, load_plan, simulate_session
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.linear import linearise_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.session.session import Gauge
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -158,6 +161,32 @@ def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
     (finding,) = result.assessment.of_kind("no convergence")
     assert finding.severity == "note"
     assert finding.numbers["sigma_mm"] == pytest.approx(result.noise.sigma * 1e3)
+
+
+def test_readings_are_weighted_by_the_scatter_of_their_gauge(root):
+    """One gauge scatters ten times as much as stated, which only the residuals show."""
+    plan = load_plan(root / "examples/sweep/plan.yaml")
+    setups = {
+        name: replace(s, gauge="noisy" if i % 2 else "good")
+        for i, (name, s) in enumerate(plan.setups.items())
+    }
+
+    def with_gauges(session, noisy):
+        gauges = {"good": Gauge(5e-6), "noisy": Gauge(noisy)}
+        return build_problem(replace(session, setups=setups, gauges=gauges), model="offsets")
+
+    exact = simulate_session(plan, TRUTH, sigma=1e-12).session
+    sigmas = [50e-6 if setups[r.setup].gauge == "noisy" else 5e-6 for r in plan.readings]
+    noise = np.random.default_rng(1).normal(size=len(sigmas)) * sigmas
+    session = exact.with_values(exact.values + noise)
+    found = fit_problem(with_gauges(session, 5e-6))
+    good, noisy = (noises.sigma for noises in found.noises.gauges)
+    assert good == pytest.approx(5e-6)
+    assert noisy == pytest.approx(50e-6, rel=0.2)  # of 81 readings
+    known = fit_problem(with_gauges(session, noisy))
+    assert found.solution.theta == pytest.approx(known.solution.theta, abs=1e-8)
+    unweighted = NonlinearProgram(with_gauges(session, 5e-6)).solve(sigma=5e-6)
+    assert np.abs(unweighted.theta - known.solution.theta).max() > 1e-6
 
 
 def test_correlations_are_those_of_the_covariance(session):
