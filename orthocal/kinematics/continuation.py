@@ -46,10 +46,6 @@ MAX_NEWTON_STEP = 1e3
 MAX_LAST_STEP = 1e-6
 """Longer steps from closed loops are caused by nearly singular postures, [m or rad]."""
 
-QUADRATIC_MARGIN = 100.0
-"""Factor of the residual expected after a step, if it falls quadratically as in the step before.
-Below the tolerance the step is the last one, and its residual is not evaluated."""
-
 MAX_NEWTON_STEPS = 30
 MAX_STEP_REDUCTIONS = 3
 UNTESTED_STEPS = 4
@@ -390,25 +386,16 @@ class _Path:
             return residuals, jacobians, largest
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
-        before, stepped = worst, np.zeros(len(x), dtype=np.bool_)
         active = np.flatnonzero(worst >= tolerance)
         for count in range(1, MAX_NEWTON_STEPS + 1):
             if not active.size:
                 break
+            before = worst.copy()
             step = system.step(residuals[active], jacobians[active])
             usable = np.isfinite(step).all(axis=1)
             rows, step = active[usable], step[usable]
-            expected = QUADRATIC_MARGIN * worst[rows] * np.square(worst[rows] / before[rows])
-            last = (expected < tolerance) & (np.abs(step) < MAX_LAST_STEP).all(axis=1)
-            before = worst.copy()
-            ended = rows[last]
-            x[ended] += step[last]
-            worst[ended], stepped[ended] = expected[last], True
-            rows, step = rows[~last], step[~last]
-            improved = [rows[:0]]
+            improved = []
             for _ in range(MAX_STEP_REDUCTIONS):
-                if not rows.size:
-                    break
                 trial = x[rows] + step
                 r, j, largest = evaluate(rows, trial)
                 better = largest < worst[rows]
@@ -417,35 +404,19 @@ class _Path:
                 worst[good] = largest[better]
                 improved.append(good)
                 rows, step = rows[~better], 0.25 * step[~better]
+                if not rows.size:
+                    break
             active = np.sort(np.concatenate(improved))
             limit = before[active] * (MAX_REMAINING if count > UNTESTED_STEPS else 1.0)
             active = active[(worst[active] >= tolerance) & (worst[active] < limit)]
-        closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
-        regular = self._step_last(x, residuals, jacobians, closed, stepped)
-        return x, worst, regular
-
-    def _step_last(
-        self, x: Array, residuals: Array, jacobians: Array, closed: Indices, stepped: Mask
-    ) -> Mask:
-        """Move closed postures by a last step, whose Jacobian is known.
-
-        Args:
-            x: Solutions, shape (n, n_x); changed.
-            residuals: Shape (n, n_rows).
-            jacobians: Shape (n, n_rows, n_x).
-            closed: Indices of the closed postures.
-            stepped: Mask of the postures that have made their last step, shape (n,).
-
-        Returns:
-            Mask of the postures that are certainly not singular, shape (n,).
-        """
         regular = np.zeros(len(x), dtype=np.bool_)
-        if closed.size and self._system.n_x:
+        closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
+        if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is known
             evaluated = residuals[closed], jacobians[closed]
             if self._allow_singular:
-                step = self._system.step(*evaluated)
+                step = system.step(*evaluated)
             else:
-                step, regular[closed] = self._system.regular_step(*evaluated)
-            small = (np.abs(step).max(axis=1) < MAX_LAST_STEP) & ~stepped[closed]
+                step, regular[closed] = system.regular_step(*evaluated)
+            small = np.abs(step).max(axis=1) < MAX_LAST_STEP
             x[closed[small]] += step[small]
-        return regular
+        return x, worst, regular

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from tolerances import CLOSED, CLOSED_FORM
 
-from orthocal import load_robot
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics import continuation
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
@@ -70,34 +69,6 @@ def test_closures_hold_at_the_solution(orthoglide):
         residual, jacobian = orthoglide.evaluate_constraints(d, p)
         assert np.abs(residual).max() < CLOSED
         assert np.linalg.matrix_rank(jacobian[:, orthoglide.passive_index]) == 18
-
-
-@pytest.mark.parametrize("name", ["orthoglide", "linear_delta", "biglide"])
-def test_the_last_step_is_not_evaluated_where_its_residual_is_known(name, monkeypatch):
-    """Its residual is expected from the quadratic convergence. Pinocchio evaluates it here."""
-    robot = load_robot(name)
-    closure, counted = LoopClosure(robot), []
-    system = closure._closing
-    evaluate = system.evaluate
-    monkeypatch.setattr(
-        system, "evaluate", lambda x, *rest: (counted.append(len(x)), evaluate(x, *rest))[1]
-    )
-    scale = 0.1 * robot.characteristic_length
-    shifts = np.random.default_rng(3).uniform(-scale, scale, (40, len(robot.drives)))
-    drives = robot.drive_zero + shifts
-
-    def close():
-        counted.clear()
-        return closure.close(drives, start=robot.reference_passive), sum(counted)
-
-    found, fewer = close()
-    monkeypatch.setattr(continuation, "QUADRATIC_MARGIN", np.inf)
-    evaluated, most = close()
-    assert fewer < 0.9 * most
-    assert np.abs(found - evaluated).max() < CLOSED
-    for d, p in zip(drives, found, strict=True):
-        residual, _ = robot.evaluate_constraints(d, p)
-        assert np.abs(residual).max() < 1e-3 * CLOSED
 
 
 def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
