@@ -108,7 +108,7 @@ def test_covariance_at_the_tool():
     total = math.sqrt(square + known.aligned.rms**2)
     assert total == pytest.approx(calibration.assessment.tool.entered, rel=SAME_NUMBER)
     without = math.sqrt(mean(e @ calibration.total_covariance @ e.transpose(0, 2, 1)))
-    text = f"gives {without * 1e6:.0f} µm instead of {math.sqrt(square) * 1e6:.0f} µm"
+    text = f"give {without * 1e6:.0f} µm instead of {math.sqrt(square) * 1e6:.0f} µm"
     assert text in PAGE
     text = f"from {eta.contrasts:.2f} contrasts, and a tool error of {total * 1e6:.0f} µm"
     assert f"$\\eta = {eta.factor:.1f}$ {text}" in PAGE

@@ -268,7 +268,7 @@ ENTRIES = {
     "resolution": (
         ["0.123"],
         ["0.123"],
-        "! Finer than the gauge (line 2): 1 of 1 readings are in inches, or",
+        "! Finer than the gauge (line 2): The gauge shows steps of 0.01 mm",
     ),
     "no text": (["\ufffd\x1b[2J"], [], r"is neither a number nor a command"),
 }
@@ -357,7 +357,9 @@ def test_a_warning_names_all_of_its_lines(root, run, tmp_path):
     fine = session.values + 3e-7 * (np.arange(len(session.readings)) < 30)
     write_session(session.with_values(fine), tmp_path / "fine")
     text = run(tmp_path / "fine").stdout
-    assert "Finer than the gauge (lines 2 to 31): 30 of 54" in text
+    words = " ".join(text.split())
+    assert "Finer than the gauge (lines 2 to 31): The gauge shows" in words
+    assert "but 30 of 54 readings have more digits" in words
 
 
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):

@@ -222,17 +222,16 @@ def test_distances_determine_the_size_of_prints(printer, session):
 
 @pytest.mark.parametrize(
     ("first", "verdict", "off"),
-    [(73.15, "reject", (0.282, -1.182, -0.140)), (74.15, "enter", (0.503, -0.968, 0.228))],
+    [(73.15, "review", (0.456, -1.285, 0.086)), (74.15, "enter", (0.503, -0.968, 0.228))],
 )
 def test_the_distances_of_5567(printer, first, verdict, off):
-    """Rejected as published: no machine within its tolerances has a first outer distance 0.8 mm
-    below the others. With 74.15 mm in its place the settings are entered. Rods stay within 1.2 mm
+    """As published the first outer distance is 0.8 mm below the others, and is named (next test).
+    With 74.15 mm in its place the settings are entered. Rods stay within 1.3 mm
     of the right ones, where Klipper's search ended at 1620, 773 and 831 mm."""
     found = calibrate(
         printer.session(analysis(outer=(first, *OUTER[1:]))), solver="variable-projection"
     )
     assert found.assessment.decision.verdict == verdict
-    assert bool(found.assessment.of_kind("beyond tolerances")) is (verdict == "reject")
     settings = fit_firmware(found, "klipper").settings
     assert np.array(settings.rods) / MM - RODS == pytest.approx(off, abs=0.02)
     assert settings.radius / MM == pytest.approx(RADIUS, abs=0.15)
@@ -240,11 +239,11 @@ def test_the_distances_of_5567(printer, first, verdict, off):
 
 @pytest.mark.slow
 def test_the_first_outer_distance_of_5567_is_the_likeliest_mistake(printer):
-    """Its omission, and no neighbour's, makes the others plausible; it is 0.8 mm short. Its odds
-    are 300 : 1; a reading is accused from 1,100 : 1 on."""
+    """Its omission, and no neighbour's, makes the others plausible; it is 0.8 mm short."""
     session = printer.session(analysis())
-    assert find_anomalies(session).found == ()
     readings, first = session.readings, len(session.readings) - 12
+    (anomaly,) = find_anomalies(session).found
+    assert anomaly.explanation.rows == (first + 6,)
     verdicts = [
         check_session(replace(session, readings=readings[:row] + readings[row + 1 :]))
         for row in (first + 6, first + 7)
