@@ -387,7 +387,7 @@ def _compensation_findings(
         if not (session.compensation if setup.compensation is None else setup.compensation)
     }
     if effects and unstated:
-        drives = len(calibration.robot.drives)
+        drives = calibration.robot.drives
         findings.append(words.compensation_not_stated(list(unstated), effects, drives))
     return findings
 

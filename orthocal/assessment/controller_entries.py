@@ -19,6 +19,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import CalibratedTool, find_tool
+from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry
 from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.calibration.records import ParameterEstimate
@@ -108,7 +109,7 @@ def compute_backlash(
     """
     by_name = {estimate.name: estimate for estimate in calibration.parameters}
     active = calibration.compensated_backlash.tolist()
-    entries, changes, determined = [], [], []
+    entries, changes, determined, limited = [], [], [], []
     for drive, active_backlash in zip(calibration.robot.drives, active, strict=True):
         estimate = by_name.get(f"{drive.name}.backlash")
         if estimate is None or not (estimate.free or estimate.value):
@@ -122,8 +123,15 @@ def compute_backlash(
         entries.append(entry)
         changes.append(_backlash_change(entry))
         determined.append(max(value, abs(value - active_backlash)) > uncertainty)
-    entering = _choose_changes(calibration, tool, changes, determined)
+        limited.append(readings_limit(calibration, f"{drive.name}.backlash"))
+    entering = _choose_changes(calibration, tool, changes, determined, limited)
     return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
+
+
+def readings_limit(calibration: Calibration, *names: str) -> bool:
+    """True if one of some parameters is known, or known better than before the readings."""
+    estimates = [p for p in calibration.parameters if p.name in names]
+    return any(not p.free or p.std < DETERMINED * p.prior_std for p in estimates)
 
 
 def _backlash_change(entry: BacklashEntry) -> dict[str, float]:
@@ -136,20 +144,25 @@ def _choose_changes(
     tool: CalibratedTool | None,
     changes: Sequence[Mapping[str, float]],
     determined: Sequence[bool],
+    limited: Sequence[bool],
 ) -> Sequence[bool]:
     """Decide which changes are entered: the determined ones, and others that lower the tool error.
 
-    The smallest undetermined changes are omitted that together do not lower it enough.
+    The smallest undetermined changes are omitted that together do not lower it enough. A change
+    that the readings do not limit is an assumption and is never entered.
 
     Args:
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
         changes: Changes of the controller's correction, each parameter to amount, [SI].
         determined: Whether each change is larger than its expanded uncertainty.
+        limited: Whether the readings limit each change (`readings_limit`).
     """
-    entered = [True] * len(changes)
+    entered = list(limited)
     omitted: dict[str, float] = {}
-    undetermined = [i for i, is_determined in enumerate(determined) if not is_determined]
+    undetermined = [
+        i for i, known in enumerate(zip(determined, limited, strict=True)) if known == (False, True)
+    ]
     for i in sorted(undetermined, key=lambda i: max(map(abs, changes[i].values()), default=0.0)):
         omitted |= changes[i]
         if _changes_tool(calibration, tool, omitted):
@@ -198,7 +211,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
     screw = find_screw_effect(robot)
     if screw is None:
         return ()
-    errors, entries, determined = calibration.errors, [], []
+    errors, entries, determined, limited = calibration.errors, [], [], []
     for drive, active in zip(robot.drives, _compensated_screws(calibration, screw), strict=True):
         names = [f"{drive.name}.{kind}" for kind in SCREW_COMPONENTS]
         identified = np.array([errors.get(name, 0.0) for name in names])
@@ -210,8 +223,9 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
         amplitudes = np.linalg.norm([identified, identified - active], axis=1)
         limits = ELLIPSE_FACTOR * np.array([uncertainty, change_uncertainty])
         determined.append(bool((amplitudes > limits).any()))
+        limited.append(readings_limit(calibration, *names))
     changes = [_screw_parameters(e.drive, e.change) for e in entries]
-    entering = _choose_changes(calibration, find_tool(calibration), changes, determined)
+    entering = _choose_changes(calibration, find_tool(calibration), changes, determined, limited)
     return tuple(
         e if enter else replace(e, enter=e.active)
         for e, enter in zip(entries, entering, strict=True)

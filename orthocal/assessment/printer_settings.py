@@ -49,6 +49,10 @@ UNKNOWN_SCALES = (MM, *(10.0 * MM,) * 2, *(MM,) * 6, 10.0 * MM, *(MM,) * 4)
 carriages, rotation and translation of the print, tilts, [m, rad]."""
 
 
+PERCENT = 0.01
+"""Unit of tilts of the bed, [1]."""
+
+
 @dataclass(frozen=True, slots=True)
 class FirmwareError:
     """Errors of a firmware's kinematics relative to the calibrated machine, [m].
@@ -77,10 +81,10 @@ class FirmwareFit:
     layer_uncertainty: float
     """RMS uncertainty of the heights of the first layer, [m]."""
     rows: tuple[SettingRow, ...]
-    """Settings one by one: radius, rods, towers, endstops."""
+    """Settings one by one: radius, rods, towers, endstops, and tilts if the firmware has them."""
     gain: Array
     """Derivative of the settings with respect to the free errors of the machine and the nuisance
-    parameters, shape (10, n), [SI]."""
+    parameters, shape (12, n), [SI]."""
 
     def expect_tool(self, error: FirmwareError) -> float:
         """Expected tool error with the uncertainty of the calibration, RMS, [m]."""
@@ -248,7 +252,7 @@ def _setting_gain(
     rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
     endstops = gain[6:9] - rods / (settings.middle - settings.shift)[:, None]
     fixed = np.zeros((1, n))
-    return np.concatenate([gain[:1], gain[3:6], gain[1:3], fixed, endstops])
+    return np.concatenate([gain[:1], gain[3:6], gain[1:3], fixed, endstops, gain[-2:]])
 
 
 def _setting_rows(
@@ -259,7 +263,8 @@ def _setting_rows(
     Args:
         calibration: The calibration.
         settings: The new settings.
-        gain: Derivative of radius, rods, angles and endstops with respect to errors, (10, n), [SI].
+        gain: Derivative of radius, rods, angles, endstops and tilts with respect to errors,
+            shape (12, n), [SI].
     """
     present = calibration.session.firmware or settings
     uncertainties = np.full(len(gain), np.nan)
@@ -275,9 +280,12 @@ def _setting_rows(
         for k, tower in enumerate("abc"):
             now, new = (getattr(s, field)[k] / scale for s in (present, settings))
             values.append((f"{label} {tower}", float(now), float(new), scale, unit))
+    if FIRMWARES[settings.firmware].tilts:
+        for axis, now, new in zip("xy", present.tilts, settings.tilts, strict=True):
+            values.append((f"tilt along {axis}", now / PERCENT, new / PERCENT, PERCENT, "%"))
     return tuple(
         SettingRow(name, now, new, float(u) / scale, unit)
-        for (name, now, new, scale, unit), u in zip(values, uncertainties.tolist(), strict=True)
+        for (name, now, new, scale, unit), u in zip(values, uncertainties.tolist(), strict=False)
     )
 
 

@@ -135,7 +135,7 @@ class Calibration(CalibrationRecord):
     def row_factor(self) -> float:
         """Factor from the noise of one reading to `sigma`: √2 if all rows are differences, else 1.
 
-        For the rows of a mixed session see `noise_factor`.
+        For the rows of a mixed session see `row_sigma`.
         """
         return math.sqrt(2.0) if self.rows_are_differences else 1.0
 
@@ -265,11 +265,18 @@ class Calibration(CalibrationRecord):
         return any(s.active is not None and s.active != active for s in self.setups)
 
     def noise_factor(self, row: ResidualRow) -> float:
-        """Standard deviation of this row over that of one reading: √2 for a difference, else 1."""
+        """Standard deviation of a row over that of one reading: √2 for a difference, else 1."""
         if row.minus is None:
             return 1.0
         sensor = next(s.sensor for s in self.setups if s.name == row.setup)
         return math.sqrt(1.0 + is_difference(row.minus, sensor))
+
+    def row_sigma(self, row: ResidualRow) -> float:
+        """Standard deviation of a row by the noise of its gauge, [m]."""
+        gauges = {s.name: s.gauge for s in self.setups}
+        noises = {g.name: g.noise for g in self.gauges}
+        noise = noises.get(gauges.get(row.setup, ""), self.noise)
+        return noise.sigma * self.noise_factor(row)
 
     def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
         """Displacement of the drives by the controller's compensation while measuring.

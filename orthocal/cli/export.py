@@ -200,7 +200,7 @@ def _read_joints(
     if differences := compare_joints(zip(drives, expected, joints.compensation, strict=True)):
         raise ParameterError(
             "has other BACKLASH or COMP_FILE than the session states under `controller` "
-            f"(backlash_mm, comp_file): {differences}. Expected is the INI file of the measurement",
+            f"(backlash, comp_file): {differences}. Expected is the INI file of the measurement",
             where=str(path),
         )
     return joints

@@ -466,6 +466,7 @@ def _draw(
 def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.accuracy import describe_gains
+    from orthocal.output.text.answer import quote_path
     from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import (
         describe_absent,
@@ -489,13 +490,13 @@ def _report(folder: Path, design: _Design) -> None:
     lines += [
         f"Wrote {folder}: {design.machine.words}.",
         f"To change a dimension, edit {folder / 'machine.yaml'}, then run",
-        f"  orthocal new {folder} --again",
+        f"  orthocal new {quote_path(folder)} --again",
         f"Wrote {folder / FIRST}: session.yaml, readings.csv, sheet.html and "
         f"{counted(programs, 'program')} in G-code.",
         "Next: look at the machine, print the sheet, measure and calibrate:",
-        f"  orthocal view {folder}",
-        f"  orthocal record {folder / FIRST}",
-        f"  orthocal calibrate {folder / FIRST} --out {folder / 'one'}",
+        f"  orthocal view {quote_path(folder)}",
+        f"  orthocal record {quote_path(folder / FIRST)}",
+        f"  orthocal calibrate {quote_path(folder / FIRST)} --out {quote_path(folder / 'one')}",
     ]
     put_out("\n".join(lines))
 
@@ -510,6 +511,7 @@ def _make_again(folder: Path) -> None:
     from orthocal.builder.build import remake_robot
     from orthocal.kinematics.reachable_box import describe_unreachable_box
     from orthocal.output.sheet.page import SHEET
+    from orthocal.output.text.answer import quote_path
 
     def check(robot: orthocal.Robot) -> None:
         box = robot.workspace
@@ -524,7 +526,10 @@ def _make_again(folder: Path) -> None:
         changes = _remake_sheet(sheet, robot) if exists(sheet.parent / "session.yaml") else []
         if changes:
             is_outdated = True
-            advice = f"plan again:\n  orthocal plan {folder} --out {sheet.parent} --force"
+            advice = (
+                "plan again:\n  orthocal plan "
+                f"{quote_path(folder)} --out {quote_path(sheet.parent)} --force"
+            )
             if _count_readings(sheet.parent):
                 advice = (
                     "it has readings, so check the dimensions: with longer legs, for instance, "

@@ -41,7 +41,7 @@ from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import MM
 
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
@@ -186,13 +186,14 @@ def _choose(
 
 def _missing_controller(session: orthocal.Session) -> str:
     """Lines about keys of the controller that a session does not state; "" if it states all."""
+    from orthocal.robot.model import drive_keys
+
     drives = session.robot.drives
-    zeros, unit = ", ".join(["0"] * len(drives)), DRIVE_UNITS[drives[0].unit][0]
-    keys = []
+    keys, zeros = [], [0.0] * len(drives)
     if session.controller_offsets is None:
-        keys.append(f"offsets_{unit}: [{zeros}]")
+        keys.append(drive_keys("offsets", drives, zeros))
     if not session.compensation:
-        keys.append(f"backlash_{unit}: [{zeros}]")
+        keys.append(drive_keys("backlash", drives, zeros))
     if not keys:
         return ""
     head = "State what the controller corrects during the measurement, one number for each drive"

@@ -63,8 +63,9 @@ MAX_COMP_FILE_ENTRIES = 256
 Compensation = tuple[JointTrim, ...]
 """Trim of the joint of each drive, in the robot's order; empty if not stated."""
 
-SAME_TRIM = 1e-9
-"""Largest difference between equal trims, [m, rad]: tables are written to 1e-6 mm."""
+SAME_TRIM = 1e-8
+"""Largest difference between equal trims, [m, rad]: they are written to 1e-6 mm or 1e-6 deg, which
+rounds angles by 0.9e-8 rad."""
 
 
 def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> bool:

@@ -44,7 +44,9 @@ def export_parameters(calibration: Calibration) -> dict[str, str]:
         f"#   {e.drive}_{e.edge_unit}: {tidy(e.enter * e.edge_factor)}"
         for e in find_entries(calibration)
     ]
-    comment = "\n".join(["# offsets to enter:", *enter, ""]) if enter else ""
+    stated = calibration.session.controller_offsets is not None
+    meaning = "offsets to enter" if stated else "changes of the offsets, which are not stated"
+    comment = "\n".join([f"# {meaning}:", *enter, ""]) if enter else ""
     text = yaml.safe_dump({"errors": errors}, sort_keys=False, default_flow_style=False)
     return {"errors.yaml": f"{_YAML_HEAD}{comment}{text}"}
 
@@ -52,10 +54,12 @@ def export_parameters(calibration: Calibration) -> dict[str, str]:
 def export_corrections(calibration: Calibration) -> dict[str, str]:
     """Text of corrections.csv: corrections of the tool over a grid, for a nominal controller.
 
-    A controller with offsets o sends the drives to ρ(p) − o for a point p. They must be at c(p),
-    the inverse kinematics of the calibrated machine. So the point to command is p + d,
+    A controller with the offsets o to enter sends the drives to ρ(p) − o for a point p. They must
+    be at c(p), the inverse kinematics of the calibrated machine. So the point to command is p + d,
 
-        d = f(c(p) + o) − p,  f the nominal forward kinematics.
+        d = f(c(p) + o − s) − p,  f the nominal forward kinematics,
+
+    with s the displacement of the drives by the controller's compensation, as while measuring.
 
     Raises:
         ExportError: If the drives do not command a tool, or the machine does not reach the grid.
@@ -66,7 +70,9 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     points = uniform_grid(robot, tool.workspace.limits, points_per_side=POINTS_PER_SIDE)
     coordinates = list(robot.tcp.coordinates)
     try:
-        drives = calibration.machine.inverse(points) + entered_offsets(calibration)
+        motors = calibration.machine.inverse(points) + entered_offsets(calibration)
+        drives = motors - calibration.displacement(motors)
+        drives = motors - calibration.displacement(drives)
         commanded = nominal_closure(robot).forward(drives)[:, coordinates]
     except ClosureError as e:
         raise ExportError(

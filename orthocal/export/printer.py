@@ -51,6 +51,11 @@ STEPS: dict[FirmwareName, Sequence[str]] = {
 """How to enter the settings."""
 
 
+SIZE = (
+    "A probed bed hardly determines the size of a print: longer rods with a larger radius print "
+    "equally flat. Measure a large print, or the rods."
+)
+
 UNCERTAIN = (
     "± is the uncertainty of a single setting (95 %). Settings compensate each other: longer rods "
     "with a larger radius print equally flat."
@@ -124,13 +129,13 @@ def _page(calibration: Calibration, fit: FirmwareFit) -> str:
             *([] if calibration.unmodelled.prior_stds.size else [UNCERTAIN, ""]),
             "## What to expect",
             "",
-            *_expectations(firmware.title, fit),
+            *_expectations(calibration, firmware.title, fit),
             "",
         ]
     )
 
 
-def _expectations(title: str, fit: FirmwareFit) -> list[str]:
+def _expectations(calibration: Calibration, title: str, fit: FirmwareFit) -> list[str]:
     """Table of the expected errors, and their limits."""
 
     def row(words: str, *values: float) -> str:
@@ -149,7 +154,5 @@ def _expectations(title: str, fit: FirmwareFit) -> list[str]:
         f"{tool_mm(new.tool_largest)}) and {tool_mm(new.layer_rms)} in the height of the first "
         f"layer (largest {tool_mm(new.layer_largest)}). The rest is the uncertainty of the "
         "calibration.",
-        "",
-        "A probed bed hardly determines the size of a print: longer rods with a larger radius print"
-        " equally flat. Measure a large print, or the rods.",
+        *([] if any(s.sensor.kind == "distance" for s in calibration.setups) else ["", SIZE]),
     ]

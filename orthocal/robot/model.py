@@ -547,6 +547,21 @@ def closure_turns(robot: Robot) -> NDArray[np.bool_]:
     return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
 
 
+def drive_keys(quantity: str, drives: Sequence[Drive], values: Sequence[float]) -> str:
+    """Keys of a session with a value of each drive, such as "offsets_mm: [0, 0]", by their units.
+
+    Args:
+        quantity: First part of the keys: offsets or backlash.
+        drives: The drives.
+        values: Value of each drive, [m, rad].
+    """
+    texts: dict[str, list[str]] = {}
+    for drive, value in zip(drives, values, strict=True):
+        unit, size = DRIVE_UNITS[drive.unit]
+        texts.setdefault(unit, []).append(f"{value / size:.6g}")
+    return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
+
+
 def closure_row_units(robot: Robot) -> Array:
     """Metres per unit of each closure row, shape (closure_rows,), [1 or m/rad].
 

@@ -186,6 +186,25 @@ def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     assert "Next: nothing to enter" in text or "Next: correct" in text
 
 
+def test_a_backlash_that_no_reading_shows_keeps_its_compensation(plan):
+    """All postures are approached from one side. The estimate follows the prior, which is no reason
+    to remove what the controller compensates."""
+    one_side = plan.select([r for r in plan.readings if r.conditions.approach == "ppp"])
+    trims = (JointTrim(20e-6),) * 3
+    found = calibrate(
+        simulate_session(replace(one_side, compensation=trims), TRUTH, seed=3, sigma=NOISE).session,
+        "full",
+        **UNJUDGED,
+    )
+    backlash = found.assessment.backlash
+    assert [(e.enter, e.change) for e in backlash] == [(pytest.approx(20e-6), 0.0)] * 3
+    text = to_text(render_answer(found, saved=Path("out")))
+    assert text.count("not determined") == 3
+    options = ExportOptions(module=False, latched=(1, 1, 1))
+    lines = export_calibration(found, "linuxcnc", options=options)
+    assert lines["joints.ini"].count("BACKLASH = 0.020") == 3
+
+
 def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration):
     """A stated 0 is an answer; so is any other number. A joined session is named."""
     kind = "compensation not stated"
@@ -258,9 +277,15 @@ def test_small_undetermined_changes_are_omitted(calibration, monkeypatch):
     sizes = (1e-6, 30e-6, 8e-6, 4e-6)
     changes = [{f"{i}.backlash": size} for i, size in enumerate(sizes)]
     determined = [False, True, False, False]
-    entered = controller_entries._choose_changes(calibration, None, changes, determined)
+    entered = controller_entries._choose_changes(
+        calibration, None, changes, determined, [True] * len(changes)
+    )
     assert entered == [False, True, True, False]
-    assert controller_entries._choose_changes(calibration, None, changes[:2], determined[:2]) == [
-        False,
-        True,
-    ]
+
+    def choose(limited):
+        return controller_entries._choose_changes(
+            calibration, None, changes[:2], determined[:2], limited
+        )
+
+    assert choose([True, True]) == [False, True]
+    assert choose([True, False]) == [False, False]

@@ -30,7 +30,11 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assessment.controller_entries import find_screws, offsets_to_enter
+from orthocal.assessment.controller_entries import (
+    entered_offsets,
+    find_screws,
+    offsets_to_enter,
+)
 from orthocal.effects.compensation import JointTrim
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
@@ -294,6 +298,19 @@ def under_tables(calibration, tmp_path_factory):
     record, files = enter_export(calibration, folder, options)
     entered = tuple(np.array(home_offsets(files["joints.ini"])) * MM)
     return replace(calibration, session=record), entered
+
+
+def test_a_table_of_corrections_counts_the_tables_of_the_controller(under_tables):
+    """Its points are those that corrected programs command."""
+    under, _ = under_tables
+    text = export_calibration(under, "table", anyway=True)["corrections.csv"]
+    rows = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1) * MM
+    field = CorrectionField(under, entered_offsets(under), within=1e-6)
+    commanded, refused = field.exactly(rows[::40, :3])
+    assert not refused
+    assert rows[::40, :3] + rows[::40, 3:] == pytest.approx(commanded, abs=2e-9)
+    uncorrected = under.machine.inverse(rows[::40, :3]) + entered_offsets(under)
+    assert np.abs(under.displacement(uncorrected)).max() > 1e-6
 
 
 def test_second_export_under_the_exported_tables_is_the_same(under_tables):

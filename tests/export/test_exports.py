@@ -71,6 +71,21 @@ def test_corrections_bring_the_tool_to_its_targets(full):
     assert np.abs(uncorrected - point).max() > 50e-6
 
 
+def test_the_parameters_say_what_their_offsets_are(full):
+    """Without stated active offsets the values are changes, not offsets to enter."""
+    unstated = replace(full, session=replace(full.session, controller_offsets=None))
+    texts = [export_calibration(c, "yaml", anyway=True)["errors.yaml"] for c in (full, unstated)]
+    assert [("# offsets to enter:" in t, "# changes of the offsets" in t) for t in texts] == [
+        (True, False),
+        (False, True),
+    ]
+    lines = export_calibration(
+        unstated, "linuxcnc", anyway=True, options=ExportOptions(module=False)
+    )
+    assert "# controller: {offsets" not in lines["joints.ini"]
+    assert "those that were active, plus these changes" in lines["README.md"]
+
+
 def test_corrections_of_offsets_alone_are_zero():
     found = calibrated(EXPERIMENT_2, **UNJUDGED)
     text = export_calibration(found, "table")["corrections.csv"]

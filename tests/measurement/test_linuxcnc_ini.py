@@ -18,8 +18,9 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.effects.compensation import compensates_alike
+from orthocal.effects.compensation import JointTrim, compensates_alike
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+from orthocal.units import DEG
 
 MM = 1e-3
 
@@ -74,6 +75,15 @@ def test_a_machine_without_compensation_has_none(folder, orthoglide):
     found = read_controller_joints(folder / "machine.ini", orthoglide).compensation
     assert len(found) == 3  # stated, not unknown
     assert compensates_alike(found, ())
+
+
+@pytest.mark.parametrize("size", [MM, DEG])
+def test_backlash_as_written_is_the_same(size):
+    """Rounded to 1e-6 mm or 1e-6 degrees, but not to 1e-4."""
+    exact = JointTrim(0.0901262614999 * size)
+    for decimals, same in ((6, True), (4, False)):
+        written = JointTrim(round(0.0901262614999, decimals) * size)
+        assert compensates_alike([exact], [written]) is same
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,11 @@ from orthocal.assessment.validation import validate_calibration
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import SessionError
+from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
 from orthocal.output.text.recording import RecordingText
+from orthocal.robot.model import drive_keys
 from orthocal.statistics.chance import BY_CHANCE
 
 OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
@@ -192,6 +194,21 @@ def test_each_key_has_the_drives_of_its_kind(tmp_path):
     text = write_session(session, tmp_path / "copy").read_text()
     assert "offsets_mm: [1.0, 2.0]" in text
     assert "offsets_mrad: [52.35" in text
+
+
+def test_printed_keys_of_mixed_drives_are_those_of_a_session(tmp_path):
+    """Also read back from the comment of exported lines, drive by drive."""
+    robot = load_mixed(tmp_path, "{offsets_mm: [0, 0], offsets_deg: [0]}").robot
+    offsets = [1e-3, np.deg2rad(3.0), -2.5e-3]
+    keys = drive_keys("offsets", robot.drives, offsets)
+    assert keys == "offsets_mm: [1, -2.5], offsets_deg: [3]"
+    (tmp_path / "again").mkdir()
+    read = load_mixed(tmp_path / "again", f"{{{keys}}}").active_offsets
+    assert np.abs(read - offsets).max() < KINEMATICS
+    lines = "".join(f"[JOINT_{i}]\nHOME_OFFSET = 0\n" for i in range(3))
+    (tmp_path / "joints.ini").write_text(f"# controller: {{{keys}}}\n{lines}")
+    stated = read_controller_joints(tmp_path / "joints.ini", robot).offsets
+    assert stated == pytest.approx(offsets, abs=KINEMATICS)
 
 
 @pytest.mark.parametrize(

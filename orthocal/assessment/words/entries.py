@@ -13,6 +13,7 @@ from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.kinematics.conditions import StatedUse
 from orthocal.measurement.files.readings_checks import describe_missing
+from orthocal.robot.model import Drive, drive_keys
 from orthocal.session.session import Session
 from orthocal.units import UM, format_fixed
 
@@ -185,16 +186,16 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool, last: str = "") 
 
 
 def compensation_not_stated(
-    sessions: Sequence[str], effects: Sequence[str], n_drives: int
+    sessions: Sequence[str], effects: Sequence[str], drives: Sequence[Drive]
 ) -> Finding:
     """Finding that a session does not state what its controller compensates.
 
     Args:
         sessions: Labels of these sessions within a joined one; otherwise an empty label.
         effects: Names of the identified effects that a controller compensates.
-        n_drives: Number of drives.
+        drives: The drives.
     """
-    zeros = ", ".join(["0"] * n_drives)
+    zeros = drive_keys("backlash", drives, [0.0] * len(drives))
     compensated = joined([COMPENSATED[effect] for effect in effects])
     which = "The session does"
     if all(sessions):
@@ -202,7 +203,7 @@ def compensation_not_stated(
     return note(
         "compensation not stated",
         f"{which} not state which {compensated} the controller compensates. It counts as none.",
-        f"State it in session.yaml, such as controller: {{backlash_mm: [{zeros}]}} for none"
+        f"State it in session.yaml, such as controller: {{{zeros}}} for none"
         f"{', or comp_file for tables' if 'screw' in effects else ''}.",
     )
 

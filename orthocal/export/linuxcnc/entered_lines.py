@@ -59,7 +59,7 @@ def describe_other_lines(
     if offsets is not None and np.abs(np.array(offsets) - entered).max() > SAME_OFFSET:
         values = joined(
             [
-                f"{d.name} {_show(d, v, sign=True)} instead of {_show(d, e, sign=True)}"
+                f"{d.name} {_show(d, v, '+.3f')} instead of {_show(d, e, '+.3f')}"
                 for d, v, e in zip(calibration.robot.drives, offsets, entered.tolist(), strict=True)
                 if abs(v - e) > SAME_OFFSET
             ]
@@ -85,7 +85,8 @@ def compare_joints(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
     """
     return joined(
         [
-            f"JOINT_{i} has {_describe(drive, trim)} instead of {_describe(drive, joint, trim)}"
+            f"JOINT_{i} has {_describe(drive, trim, joint)} instead of "
+            f"{_describe(drive, joint, trim)}"
             for i, (drive, joint, trim) in enumerate(joints)
             if not compensates_alike([joint], [trim])
         ]
@@ -105,15 +106,17 @@ def _pair_trims(
     return list(zip(drives, expected, trims, strict=True))
 
 
-def _describe(drive: Drive, trim: JointTrim, other: JointTrim | None = None) -> str:
+def _describe(drive: Drive, trim: JointTrim, other: JointTrim) -> str:
     """Compensation of a joint in a few words, beside another one."""
     if trim.table is not None:
-        both = other is not None and other.table is not None
-        return "another table" if both else "a table (COMP_FILE)"
-    return f"BACKLASH {_show(drive, trim.backlash)}" if trim.backlash else "BACKLASH 0 or none"
+        return "another table" if other.table is not None else "a table (COMP_FILE)"
+    if not trim.backlash:
+        return "BACKLASH 0 or none"
+    alike = _show(drive, trim.backlash) == _show(drive, other.backlash)
+    return f"BACKLASH {_show(drive, trim.backlash, '.7f' if alike else '.3f')}"
 
 
-def _show(drive: Drive, value: float, *, sign: bool = False) -> str:
+def _show(drive: Drive, value: float, form: str = ".3f") -> str:
     """Value with its unit, mm or deg."""
     unit, size = DRIVE_UNITS[drive.unit]
-    return f"{value / size:{'+' if sign else ''}.3f} {unit}"
+    return f"{value / size:{form}} {unit}"

@@ -28,8 +28,12 @@ from orthocal.export.linuxcnc.c_source import fill_template
 from orthocal.export.linuxcnc.drive_compensation import NEGLIGIBLE, JointCompensation
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
+from orthocal.robot.model import drive_keys
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
+
+UNSTATED = "those that were active, plus these changes"
+"""Offsets of the drives if the session does not state the active ones."""
 
 SMALLEST_ERROR = 1e-9
 """Smallest error that README.md states, [m]."""
@@ -43,11 +47,12 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
         homes: The joints.
         stated: Whether the directions in which homing latches the switches were stated.
     """
-    lines = [
-        "# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines.",
-        "# With these lines a session states the offsets of the drives:",
-        f"# {_describe_offsets(calibration)}",
-    ]
+    lines = ["# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines."]
+    if calibration.session.controller_offsets is not None:  # otherwise only changes are known
+        lines += [
+            "# With these lines a session states the offsets of the drives:",
+            f"# {_describe_offsets(calibration)}",
+        ]
     for i, home in enumerate(homes):
         lines += [
             "",
@@ -64,10 +69,8 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
 
 def _describe_offsets(calibration: Calibration) -> str:
     """Key of session.yaml with the offsets to enter."""
-    drives = calibration.robot.drives
-    unit, size = DRIVE_UNITS[drives[0].unit]
-    values = ", ".join(f"{v / size:.6g}" for v in offsets_to_enter(calibration))
-    return f"controller: {{offsets_{unit}: [{values}]}}"
+    offsets = offsets_to_enter(calibration).tolist()
+    return f"controller: {{{drive_keys('offsets', calibration.robot.drives, offsets)}}}"
 
 
 def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
@@ -312,11 +315,12 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         )
     if assessment_of(calibration).keeps_offsets:
         scope = "The offsets do not change."
+    stated_offsets = calibration.session.controller_offsets is not None
     values = {
         "robot": comment_safe(calibration.robot.name),
         "scope": scope,
         "table": "\n".join(rows),
-        "active": _describe_offsets(calibration),
+        "active": f"`{_describe_offsets(calibration)}`" if stated_offsets else UNSTATED,
         "compensation": _describe_compensation(homes, stated=stated)
         + _describe_undetermined(calibration)
         + _describe_undetermined_screws(calibration),

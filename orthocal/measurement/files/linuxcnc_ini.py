@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +23,11 @@ from orthocal.units import DRIVE_UNITS
 COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
 
-EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{offsets_(\w+): \[([^\]]*)\]\}$")
-"""Comment of exported lines with the offsets of the slides."""
+EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{(offsets_[^{}]*)\}$")
+"""Comment of exported lines with the offsets of the drives (`drive_keys`)."""
+
+OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
+"""Offsets of the drives with one unit in this comment."""
 
 METRIC_UNITS = ("mm", "metric")
 """Values of LINEAR_UNITS with which lengths are in mm."""
@@ -81,22 +84,23 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         tuple(limits),
         tuple(latch or 1 for latch in latched) if stated else None,
         tuple(trims),
-        None if stated else _read_offsets(path, len(robot.drives)),
+        None if stated else _read_offsets(path, robot.drives),
     )
 
 
-def _read_offsets(path: Path, n_drives: int) -> tuple[float, ...] | None:
-    """Offsets of the slides that a comment of exported lines states, [m, rad]; None without it."""
-    sizes = {unit: size for unit, size in DRIVE_UNITS.values()}
+def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | None:
+    """Offsets of the drives that a comment of exported lines states, [m, rad]; None without it."""
     match = EXPORTED_OFFSETS.search(read_text(path, error=ParameterError))
-    if match is None or match[1] not in sizes:
-        return None
-    cells = match[2].split(",")
+    stated = {} if match is None else dict(OFFSETS_OF_UNIT.findall(match[1]))
     try:
-        values = tuple(float(cell) * sizes[match[1]] for cell in cells)
+        values = {unit: [float(v) for v in text.split(",")] for unit, text in stated.items()}
     except ValueError:
         return None
-    return values if len(values) == n_drives else None
+    units = [DRIVE_UNITS[d.unit] for d in drives]
+    names = [unit for unit, _ in units]
+    if {unit: len(v) for unit, v in values.items()} != {n: names.count(n) for n in names}:
+        return None
+    return tuple(values[unit].pop(0) * size for unit, size in units)
 
 
 def _read_joint(

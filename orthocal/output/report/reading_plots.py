@@ -13,6 +13,7 @@ from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 from scipy import special
 
+from orthocal.arrays import Array
 from orthocal.assessment.circular_deviation import Circle
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.residual_rows import (
@@ -63,7 +64,7 @@ def plot_residuals(calibration: Calibration) -> Figure:
     figure, axes = open_list(title, _row_names(calibration, rows))
     y = np.arange(len(rows))
     before, after = (np.array([f(r) for r in rows]) / MM for f in (_deviation, _residual))
-    sigma = np.array([_row_sigma(calibration, r) for r in rows]) / MM
+    sigma = np.array([calibration.row_sigma(r) for r in rows]) / MM
     if np.isfinite(sigma).all():
         kind = "row" if np.ptp(sigma) > 0.0 else _row_noun(calibration)
         shade(axes, y, -2.0 * sigma, 2.0 * sigma, f"±2 σ of a {kind}")
@@ -98,7 +99,8 @@ def plot_setups(calibration: Calibration) -> Figure:
             sizes = np.maximum(sizes[finite], SMALLEST_LENGTH) / MM
             axes.plot(sizes, y[finite] + shift, label=label, **look)
             shown.append(sizes)
-    if math.isfinite(calibration.sigma) and calibration.sigma > SMALLEST_LENGTH:
+    one_gauge = len(calibration.gauges) == 1
+    if one_gauge and math.isfinite(calibration.sigma) and calibration.sigma > SMALLEST_LENGTH:
         sigma = calibration.sigma / MM
         axes.axvline(sigma, color="black", linestyle=":", label=f"σ of a {_row_noun(calibration)}")
         shown.append(np.array([sigma]))
@@ -110,10 +112,11 @@ def plot_setups(calibration: Calibration) -> Figure:
 
 @plot("spread")
 def plot_spread(calibration: Calibration) -> Figure:
-    """Normal quantile plot of the residuals, with the noise as a line."""
-    noun = _row_noun(calibration)
-    scaled = np.array([_residual(r) / calibration.noise_factor(r) for r in calibration.residuals])
-    values = np.sort(scaled) * calibration.row_factor / MM
+    """Normal quantile plot of the residuals, with the noise as a line.
+
+    Residuals of several gauges are divided by the noise of their gauges.
+    """
+    values, unit, lines = _spread(calibration)
     quantiles = special.ndtri((np.arange(values.size) + 0.5) / values.size)
     chosen = _thin(values.size)
     figure = open_figure(3.8, "Normal quantile plot of the residuals")
@@ -123,31 +126,35 @@ def plot_spread(calibration: Calibration) -> Figure:
     axes.plot(quantiles[chosen], values[chosen], label=label, **look)
     # parameters and gauge zeros reduce the residuals by their degrees of freedom
     reduction = math.sqrt(min(calibration.noise.residual_dof / values.size, 1.0))
-    gauge = calibration.session.gauge_sigma
-    stated = math.nan if gauge is None else gauge * calibration.row_factor
     ends = np.array([-1.0, 1.0]) * max(abs(float(quantiles[0])), 1.0)
-    for sigma, name, line in (
-        (calibration.sigma, f"σ of a {noun}", "-"),
-        (stated, "σ stated for the gauge", "--"),
-    ):
+    for sigma, label, line in lines:
         if math.isfinite(sigma):
-            label = f"{name}: {sigma / MM:.2g} mm"
-            axes.plot(
-                ends, ends * reduction * sigma / MM, color="black", linestyle=line, label=label
-            )
+            axes.plot(ends, ends * reduction * sigma, color="black", linestyle=line, label=label)
     axes.grid(True)
     axes.set_xlabel(
         "normal quantile, expected from noise alone [σ]\n"
         "lines: σ reduced by the degrees of freedom of parameters and gauge zeros"
     )
-    axes.set_ylabel("residual after [mm]")
+    axes.set_ylabel(f"residual after [{unit}]")
     draw_legend(figure, axes)
     return figure
 
 
-def _row_sigma(calibration: Calibration, row: ResidualRow) -> float:
-    """Standard deviation of a row, [m]."""
-    return calibration.sigma * calibration.noise_factor(row) / calibration.row_factor
+def _spread(calibration: Calibration) -> tuple[Array, str, list[tuple[float, str, str]]]:
+    """Sorted residuals in a unit, and the noise in it with label and look of its line."""
+    rows = calibration.residuals
+    residuals = np.array([_residual(r) for r in rows])
+    if len(calibration.gauges) > 1:
+        sigmas = np.array([calibration.row_sigma(r) for r in rows])
+        return np.sort(residuals / sigmas), "σ of its gauge", [(1.0, "σ of each gauge", "-")]
+    factors = np.array([calibration.noise_factor(r) for r in rows])
+    gauge, sigma = calibration.session.gauge_sigma, calibration.sigma / MM
+    stated = math.nan if gauge is None else gauge * calibration.row_factor / MM
+    lines = [
+        (sigma, f"σ of a {_row_noun(calibration)}: {sigma:.2g} mm", "-"),
+        (stated, f"σ stated for the gauge: {stated:.2g} mm", "--"),
+    ]
+    return np.sort(residuals / factors) * calibration.row_factor / MM, "mm", lines
 
 
 def _row_noun(calibration: Calibration) -> str:

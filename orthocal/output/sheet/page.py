@@ -33,7 +33,7 @@ from orthocal.output.sheet.gauge_position import (
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
-from orthocal.robot.model import PARALLEL_SINE, Robot
+from orthocal.robot.model import PARALLEL_SINE, Robot, drive_keys
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
 from orthocal.sensors.protocol import has_dial, mounting_steps, tool_path
@@ -473,11 +473,11 @@ def _active_offsets(session: Session) -> str:
     """The offsets that must be active in the controller."""
     drives = session.robot.drives
     if session.controller_offsets is None:
-        key = "offsets_mm" if all(d.unit == "m" for d in drives) else "offsets_deg"
+        keys = drive_keys("offsets", drives, [0.0] * len(drives))
         return (
             "session.yaml does not state the offsets of the controller. Before the first "
-            f"calibration write `controller: {{{key}: [{', '.join('0' for _ in drives)}]}}` into "
-            "it, afterwards the offsets that you entered. They are not HOME_OFFSET."
+            f"calibration write `controller: {{{keys}}}` into it, afterwards the offsets that you "
+            "entered. They are not HOME_OFFSET."
         )
     if not _is_corrected(session):
         return (
@@ -513,8 +513,8 @@ def _compensation(session: Session) -> str:
     return (
         "session.yaml does not state which backlash the controller compensates (LinuxCNC: "
         "BACKLASH, COMP_FILE). Write it into session.yaml, 0 for none, in the order "
-        f"{', '.join(d.name for d in session.robot.drives)}: controller: {{backlash_mm: ["
-        f"{', '.join(['0'] * len(session.robot.drives))}]}}."
+        f"{', '.join(d.name for d in session.robot.drives)}: controller: "
+        f"{{{drive_keys('backlash', session.robot.drives, [0.0] * len(session.robot.drives))}}}."
     )
 
 

@@ -13,8 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import expanded_uncertainty, lowers
-from orthocal.assessment.effect_limits import DETERMINED
+from orthocal.assessment.controller_entries import expanded_uncertainty, lowers, readings_limit
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -415,7 +414,7 @@ def render_values(calibration: Calibration) -> RenderableType:
     complete = trusted and calibration.only_offsets
     table = entry_table(calibration, identified=not calibration.only_offsets)
     keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
-    meaning = "Slide coordinate = encoder coordinate + offset."
+    meaning = "Drive coordinate = encoder coordinate + offset."
     explained = complete or not (
         trusted and stated and not keep
     )  # above this section, or not needed
@@ -438,23 +437,22 @@ def render_backlash(calibration: Calibration) -> RenderableType:
     is not determined.
     """
     entries = assessment_of(calibration).backlash
-    rows, halves, known, small = [], [], False, True
+    rows, known, small = [], False, True
+    largest: dict[str, float] = {}
     for e in entries:
         factor, uncertainty = e.edge_factor, expanded_uncertainty(calibration, e)
         half = plain(uncertainty * factor)
         is_known = e.active > 0.0 or e.identified > uncertainty
         known |= is_known or bool(e.change)
-        error = calibration[f"{e.drive}.backlash"]
-        limited = error.std < DETERMINED * error.prior_std
+        limited = readings_limit(calibration, f"{e.drive}.backlash")
         small &= limited
-        keep = UNCHANGED if is_known or limited else "not determined"
+        keep = UNCHANGED if limited else "not determined"
         enter = plain(e.enter * factor) if e.change else keep
         rows.append((e.drive, plain(e.active * factor), enter, half, e.edge_unit))
-        halves.append(f"±{half} {e.edge_unit}")
+        largest[e.edge_unit] = max(uncertainty * factor, largest.get(e.edge_unit, 0.0))
     if not known:
-        return Text(
-            f"Backlash: {'not significant' if small else 'not determined'} ({max(halves)})."
-        )
+        halves = joined([f"±{plain(v)} {unit}" for unit, v in largest.items()])
+        return Text(f"Backlash: {'not significant' if small else 'not determined'} ({halves}).")
     return table_of(("backlash", "now", "new", "±", "unit"), rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -45,7 +46,7 @@ from orthocal.sensors.tool_indicator import ToolIndicator
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Reading, Session
 from orthocal.text import capitalised
-from orthocal.units import EDGE_UNITS, MM, UM
+from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM
 
 FORMS: dict[Criterion, str] = {
     "aligned": "RMS tool error, workpiece aligned on the machine",
@@ -57,7 +58,7 @@ FORMS: dict[Criterion, str] = {
 }
 """Criteria in words."""
 
-PLAN_BASIS = {"travel_mm": "travel", "workspace_mm": "workspace"}
+PLAN_BASIS = {"travel": "travel", "workspace_mm": "workspace"}
 """Keys of plan.json for the properties of the machine on which a plan depends, with words."""
 
 SOME_LOST = 0.01
@@ -289,10 +290,19 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
 
 
 def describe_basis(robot: Robot) -> dict[str, Any]:
-    """Properties of a machine on which a plan depends, by the keys of `PLAN_BASIS`, in mm."""
-    travel = np.array([[d.lower, d.upper] for d in robot.drives])
+    """Properties of a machine on which a plan depends, by the keys of `PLAN_BASIS`.
+
+    Travel is in mm or deg, with None for a drive without limit; the workspace is in mm.
+    """
+    travel = [
+        [
+            round(limit / DRIVE_UNITS[d.unit][1], 6) if math.isfinite(limit) else None
+            for limit in (d.lower, d.upper)
+        ]
+        for d in robot.drives
+    ]
     return {
-        "travel_mm": np.round(travel / MM, 6).tolist(),
+        "travel": travel,
         "workspace_mm": np.round(find_workspace(robot).limits / MM, 6).tolist(),
     }
 
@@ -326,7 +336,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "robot": plan.session.robot.name,
         "model": plan.forecast.selection.label,
         "criterion": plan.criterion,
-        "travel_mm": basis["travel_mm"],
+        "travel": basis["travel"],
         "workspace_mm": None if box is None else np.round(box / MM, 6).tolist(),
         "setups": len(one_row_per_point(plan.session).setups),
         "readings": read,

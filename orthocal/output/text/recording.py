@@ -24,6 +24,7 @@ from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
+from orthocal.robot.model import drive_keys
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name
@@ -429,11 +430,11 @@ class RecordingText:
             return f"{self.wrap(state)}\nContinue with:\n  orthocal record {command}"
         lines = [f"All {counted(recording.count, 'reading')} are recorded."]
         if session.controller_offsets is None:
-            keys = "offsets_mm" if session.robot.drives[0].unit == "m" else "offsets_deg"
-            zeros = ", ".join("0" for _ in session.robot.drives)
+            drives = session.robot.drives
+            keys = drive_keys("offsets", drives, [0.0] * len(drives))
             lines.append(
                 "State in session.yaml which offsets are active in the controller, one number per "
-                f"drive, such as `controller: {{{keys}: [{zeros}]}}`. Without them only their "
+                f"drive, such as `controller: {{{keys}}}`. Without them only their "
                 "changes can be calculated."
             )
         following = f"Next:\n  orthocal calibrate {command}"

@@ -214,7 +214,6 @@ def render_readings(
     calibration: Calibration, *, all_rows: bool = False, worst_first: bool = False
 ) -> RenderableType:
     """Readings before and after calibration, the worst of many or all."""
-    noise = calibration.noise.sigma
     residuals = calibration.residuals
     if worst_first:
         residuals = tuple(sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual))))
@@ -229,7 +228,7 @@ def render_readings(
         "measured [mm]": lambda r: signed(r.measured / MM),
         "before [mm]": lambda r: signed(r.deviation / MM),
         "after [mm]": lambda r: signed(r.residual / MM),
-        "in σ": lambda r: _ratio(r.residual, noise * calibration.noise_factor(r)),
+        "in σ": lambda r: _ratio(r.residual, calibration.row_sigma(r)),
         "studentised": lambda r: f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else "",
         "influence": lambda r: f"{r.influence:.1f}",
     }
@@ -250,6 +249,9 @@ def render_fit(calibration: Calibration) -> RenderableType:
     ):
         change = f"{after / before - 1.0:+.0%}" if before > NOTHING else ""
         rows.append((name, mm(before), mm(after), change))
+    table = table_of(("", "before", "after", ""), rows)
+    if len(c.gauges) > 1:
+        return noted(table, *(f"σ of {g.name}: {mm(g.noise.sigma)} mm" for g in c.gauges))
     row = "a difference" if c.rows_are_differences else "a reading"
     dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
     text = f"σ of {row}: {mm(c.sigma)} mm, {NOISE_SOURCES[noise.source]}{dof}"
@@ -266,7 +268,7 @@ def render_fit(calibration: Calibration) -> RenderableType:
         if c.rows_are_differences:
             text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
         lines.append(text)
-    return noted(table_of(("", "before", "after", ""), rows), *lines)
+    return noted(table, *lines)
 
 
 def render_sensors(calibration: Calibration) -> RenderableType | None:

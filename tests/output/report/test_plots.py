@@ -10,13 +10,14 @@ from xml.etree import ElementTree
 import matplotlib
 import numpy as np
 import pytest
-from calibrated import EXPERIMENT_2, SOUND, UNJUDGED, calibrated
+from calibrated import EXPERIMENT_2, SOUND, UNJUDGED, calibrated, identified, session_of
 from scipy import stats
 
 from orthocal import Choice, calibrate, load_session
 from orthocal.output.report import figure as style
 from orthocal.output.report import parameter_plots, reading_plots
 from orthocal.output.text import layout
+from orthocal.output.text.tables import render_readings
 from orthocal.units import MM
 
 PLOTS = (
@@ -375,6 +376,23 @@ def test_residuals_are_plotted_against_normal_quantiles(raw):
     np.testing.assert_allclose(y, np.sort([r.residual * 1e3 for r in raw.residuals]), atol=UNIT)
     np.testing.assert_allclose(x, stats.norm.ppf((np.arange(54) + 0.5) / 54), atol=QUANTILE)
     assert (y[np.abs(x) < 1.0].max()) < 2.0 * raw.sigma * 1e3
+
+
+def test_rows_of_several_gauges_are_compared_with_their_own_noise():
+    """A dial of 0.01 mm beside one that scatters 60 times as much."""
+    joined = identified([session_of("raw-cycles"), session_of("workshop")])
+    sigma = {g.name: g.noise.sigma for g in joined.gauges}
+    assert len({round(s, 9) for s in sigma.values()}) == 2
+    own = [r.residual / sigma[r.setup.partition("/")[0]] for r in joined.residuals]
+    axes = reading_plots.plot_spread.figure(joined).axes[0]
+    _, y = line(axes, f"residuals after: {len(own)}")
+    np.testing.assert_allclose(y, np.sort(own), atol=UNIT)
+    assert axes.get_ylabel() == "residual after [σ of its gauge]"
+    (band,) = reading_plots.plot_residuals.figure(joined).axes[0].containers
+    assert len({round(b.get_width(), 9) for b in band}) == 2
+    shown = layout.to_text(render_readings(joined, all_rows=True))
+    rows = [text.split() for text in shown.splitlines() if "/" in text]
+    assert all(f"{v:+.1f}" in cells for v, cells in zip(own, rows, strict=True))
 
 
 def test_lines_of_the_spread_are_sigma_less_what_was_fitted(table1, raw):
