@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthogli
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.output.text.plan import describe_basis
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.first_plan import first_equipment
@@ -46,6 +48,16 @@ def written(folder, machine, name="machine"):
     (folder / f"{name}.urdf").write_text(machine.urdf(name))
     (folder / f"{name}.yaml").write_text(machine.yaml())
     return load_robot(folder)
+
+
+def test_the_travel_of_a_plan_has_the_units_of_its_drives(root):
+    """Degrees for motors, and nothing for one that turns without end."""
+    fivebar = load_robot(root / "examples/fivebar")
+    drives = (fivebar.drives[0], replace(fivebar.drives[1], lower=-np.inf, upper=np.inf))
+    basis = describe_basis(replace(fivebar, drives=drives))
+    limits = np.rad2deg([fivebar.drives[0].lower, fivebar.drives[0].upper])
+    assert basis["travel"] == [pytest.approx(limits, abs=1e-6), [None, None]]
+    json.dumps(basis, allow_nan=False)
 
 
 @pytest.mark.parametrize("angles", [(210, 330, 90), (212, 329, 91)])

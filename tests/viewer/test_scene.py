@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,6 +20,7 @@ from calibrated import (
     scene_of,
     session_of,
 )
+from effect_plans import effect_plan
 from gauges import exact
 from tolerances import KINEMATICS
 
@@ -30,7 +32,7 @@ from orthocal.errors import ParameterError
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.observation.simulate import simulate_session
 from orthocal.output.scene import drawing, readings, tool_errors
-from orthocal.output.scene.deviations import measure_deviations
+from orthocal.output.scene.deviations import measure_deviations, measurement_of_calibration
 from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.viewer import machine as machine_scene
 from orthocal.viewer.scene import FRAME_RATE, round_scale
@@ -211,6 +213,40 @@ def test_active_offsets_move_the_ghost(root):
     assert np.abs(ghost - target).max() < 1e-11
 
 
+def test_each_session_has_its_own_offsets(root):
+    """The nominal machine of a joined calibration stands where its controller assumed it."""
+    first = load_session(root / "examples/raw-cycles")
+    offsets = np.array([1e-3, -2e-3, 0.5e-3])
+    postures = {n: replace(p, drives=p.drives - offsets) for n, p in first.postures.items()}
+    second = replace(first, controller_offsets=offsets, postures=postures, title="second")
+    second = second.with_values(second.values + 1e-6)
+    joined = identified([replace(first, title="first"), second])
+    measured = measurement_of_calibration(joined)
+    assert {tuple(v) for v in measured.active.values()} <= {(0.0, 0.0, 0.0), tuple(offsets)}
+    for name, drives in measured.drives.items():
+        target = drives + measured.active.get(name, measured.offsets)
+        expected = first.postures[name.rpartition("/")[2]].drives
+        assert target == pytest.approx(expected, abs=1e-12)
+    scene = draw_scene(joined, posture=next(iter(measured.drives)))
+    robot, drives = first.robot, next(iter(first.postures.values())).drives
+    target = placed(robot, drives, robot.close_with_pinocchio(drives, robot.reference_passive))
+    assert np.abs(world(scene, f"{drawing.GHOST}/platform") - target["platform"]).max() < 1e-11
+
+
+def test_readings_of_several_approaches_are_not_averaged():
+    plan = effect_plan("backlash")
+    truth = {"x_slide.backlash": 60e-6}
+    session = simulate_session(plan, truth, seed=1, sigma=1e-7).session
+    rows = measure_deviations(session)
+    approaches = {r.approach for r in session.readings}
+    assert len(approaches) > 2
+    assert {r.approach for r in rows} == approaches
+    assert all(f"approach {r.approach}" in r.where for r in rows)
+    assert max(r.cycles for r in rows) == max(
+        Counter((r.setup, r.posture, r.approach) for r in session.readings).values()
+    )
+
+
 def test_leg_lines_go_from_root_to_tip(scene, calibration):
     """Both ends of a leg line belong to drawn links."""
     root = world(scene, f"{drawing.SOLID}/x_yoke")[:3, 3]
@@ -269,6 +305,12 @@ def test_scene_states_the_offsets_to_enter(scene, calibration):
     fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
     for entry in find_entries(calibration):
         assert f"{entry.drive} {entry.enter * 1e3:+.3f}".replace("-", "−") + " mm" in fact
+
+
+def test_scene_against_the_verdict_states_nothing_to_enter(calibration):
+    decision = replace(calibration.assessment.decision, verdict="review")
+    doubtful = replace(calibration, assessment=replace(calibration.assessment, decision=decision))
+    assert not any("Offsets to enter" in fact for fact in draw_scene(doubtful).facts)
 
 
 def test_of_many_gauges_the_overview_names_the_worst(full, overview):

@@ -14,7 +14,7 @@ from orthocal.errors import ParameterError
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
-from orthocal.session.session import Session, Setup
+from orthocal.session.session import Session, Setup, known_approach
 from orthocal.statistics.zeros import project_out_zeros
 
 Place = tuple[str, str]
@@ -39,13 +39,16 @@ class Deviation:
     """Measured minus nominal reading, [m]."""
     after: float | None
     """Measured minus calibrated reading, [m]; None without a calibration."""
+    approach: str | None = None
+    """Approach of the drives, if the posture was read with several; they are not averaged."""
     cycles: int = 1
     """Number of cycles."""
 
     @property
     def where(self) -> str:
-        """Name of the posture, or of the difference of postures."""
-        return f"{self.posture} − {self.minus}" if self.minus else self.posture
+        """Name of the posture, or of the difference of postures, and the approach."""
+        name = f"{self.posture} − {self.minus}" if self.minus else self.posture
+        return f"{name}, approach {self.approach}" if self.approach else name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +60,9 @@ class Measurement:
     drives: Mapping[str, Array]
     """Posture to commanded drive coordinates, shape (n_drives,), [m, rad]."""
     offsets: Array
-    """Offsets active in the controller, shape (n_drives,), [m, rad]."""
+    """Offsets active in the controller at the end, shape (n_drives,), [m, rad]."""
+    active: Mapping[str, Array]
+    """Posture to the offsets active in its session, shape (n_drives,), [m, rad]."""
     rows: tuple[Deviation, ...]
     """Deviations, averaged over the cycles."""
     count: int
@@ -79,6 +84,8 @@ class Stop:
     name: str
     drives: Array
     """Commanded drive coordinates, shape (n_drives,), [m, rad]."""
+    offsets: Array
+    """Offsets active in the controller, shape (n_drives,), [m, rad]."""
     rows: tuple[Deviation, ...] = ()
     """Deviations of the gauges at this stop, at most one per setup."""
     place: Place | None = None
@@ -109,21 +116,30 @@ def measure_deviations(session: Session) -> tuple[Deviation, ...]:
         entries = observations.values(read.values) - predicted
         deviations[rows] = observations.rows(project_out_zeros(entries, observations))
     return _average(
-        Deviation(r.setup, r.posture, r.minus, float(v), None)
+        Deviation(r.setup, r.posture, r.minus, float(v), None, r.approach)
         for r, v in zip(session.readings, deviations, strict=True)
     )
 
 
 def _average(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
-    """Average deviations over the cycles of each setup and posture."""
-    groups: dict[tuple[str, str, str | None], list[Deviation]] = {}
+    """Average deviations over the cycles of each setup, posture and approach."""
+    groups: dict[tuple[str, str, str | None], dict[str | None, list[Deviation]]] = {}
     for row in rows:
-        groups.setdefault((row.setup, row.posture, row.minus), []).append(row)
+        place = groups.setdefault((row.setup, row.posture, row.minus), {})
+        place.setdefault(row.approach, []).append(row)
     means = []
-    for key, group in groups.items():
-        after = [r.after for r in group if r.after is not None]
-        before = float(np.mean([r.before for r in group]))
-        means.append(Deviation(*key, before, float(np.mean(after)) if after else None, len(group)))
+    for key, approaches in groups.items():
+        for approach, group in approaches.items():
+            after = [r.after for r in group if r.after is not None]
+            means.append(
+                Deviation(
+                    *key,
+                    before=float(np.mean([r.before for r in group])),
+                    after=float(np.mean(after)) if after else None,
+                    approach=approach if len(approaches) > 1 else None,
+                    cycles=len(group),
+                )
+            )
     return tuple(means)
 
 
@@ -134,6 +150,7 @@ def measurement_of_session(session: Session) -> Measurement:
         setups=session.setups,
         drives={name: p.drives for name, p in session.postures.items()},
         offsets=np.asarray(session.active_offsets),
+        active={},
         rows=measure_deviations(session),
         count=len(session.readings),
         largest_after=None,
@@ -143,14 +160,24 @@ def measurement_of_session(session: Session) -> Measurement:
 
 def measurement_of_calibration(calibration: Calibration) -> Measurement:
     """Postures, setups and deviations of a calibration, before and after."""
-    robot, offsets = calibration.robot, calibration.session.controller_offsets
+    robot = calibration.robot
+    of_setup = {s.name: s.active for s in calibration.setups if s.active is not None}
     return Measurement(
         robot=robot,
         setups={s.name: Setup(s.name, s.sensor, payload=s.payload) for s in calibration.setups},
         drives={p.name: np.array(p.drives) for p in calibration.postures},
-        offsets=np.zeros(len(robot.drives)) if offsets is None else np.array(offsets),
+        offsets=calibration.active_offsets,
+        active={
+            name: np.array(of_setup[r.setup])
+            for r in calibration.residuals
+            if r.setup in of_setup
+            for name in (r.posture, r.minus)
+            if name is not None
+        },
         rows=_average(
-            Deviation(r.setup, r.posture, r.minus, r.deviation, r.residual)
+            Deviation(
+                r.setup, r.posture, r.minus, r.deviation, r.residual, known_approach(r.conditions)
+            )
             for r in calibration.residuals
         ),
         count=len(calibration.residuals),
@@ -190,14 +217,14 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
                 where="posture",
             )
         return [_stop_at(measured, posture, measured.rows, None)], 0
-    overview = Stop("overview", zero, worst_of_setups(measured.rows))
+    overview = Stop("overview", zero, measured.offsets, worst_of_setups(measured.rows))
     path: list[Stop] = []
     for place in dict.fromkeys(measured.place(r) for r in measured.rows):
         rows = [r for r in measured.rows if measured.place(r) == place]
         names = dict.fromkeys(n for r in rows for n in (r.posture, r.minus) if n is not None)
         stops = [_stop_at(measured, name, rows, place) for name in names]
         if not np.allclose(stops[0].drives, zero, rtol=0.0, atol=1e-9):
-            path.append(Stop("zero", zero, place=place))
+            path.append(Stop("zero", zero, measured.offsets, place=place))
         path += stops
     chosen = np.unique(np.linspace(0, len(path) - 1, min(MAX_STOPS, len(path))).round())
     return [overview, *(path[int(i)] for i in chosen), overview], len(path) - len(chosen)
@@ -209,7 +236,8 @@ def _stop_at(
     """Stop at a posture with the deviations of some rows."""
     deviations = worst_of_setups(r for r in rows if r.posture == name)
     minuends = dict.fromkeys(r.posture for r in rows if r.minus == name)
-    return Stop(name, measured.drives[name], deviations, place, tuple(minuends))
+    offsets = measured.active.get(name, measured.offsets)
+    return Stop(name, measured.drives[name], offsets, deviations, place, tuple(minuends))
 
 
 def _suggest(name: str, postures: Sequence[str]) -> str:

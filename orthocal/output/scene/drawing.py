@@ -175,7 +175,8 @@ def _state_zero(robot: Robot) -> list[str]:
 def _tour(robot: Robot) -> list[Stop]:
     """Stops at the mechanical zero and, for every drive, towards both ends of its travel."""
     units = np.where(coordinate_units(robot) == 1.0, robot.characteristic_length, 1.0)
-    stops = [Stop("mechanical zero", robot.drive_zero)]
+    none = np.zeros(len(robot.drives))
+    stops = [Stop("mechanical zero", robot.drive_zero, none)]
     for i, drive in enumerate(robot.drives):
         unit = float(units[robot.drive_index[i]])
         for end, direction in ((drive.lower, "down"), (drive.upper, "up")):
@@ -185,7 +186,7 @@ def _tour(robot: Robot) -> list[Stop]:
             travel = math.copysign(min(abs(travel), MAX_TRAVEL * unit), travel)
             target = _find_reachable(robot, i, 0.4 * travel)
             if target is not None:
-                stops += [Stop(f"{drive.name} {direction}", target), stops[0]]
+                stops += [Stop(f"{drive.name} {direction}", target, none), stops[0]]
     return stops
 
 
@@ -214,7 +215,7 @@ def _draw_session(session: Session, posture: str | None) -> Scene:
     robot, measured = session.robot, measurement_of_session(session)
     drawing = MachineScene(robot, session.title, sensor_frames=_sensor_frames(measured))
     stops, omitted = plan_stops(measured, posture)
-    timeline = plan_motion([s.drives + measured.offsets for s in stops])
+    timeline = plan_motion([s.drives + s.offsets for s in stops])
     poses = _follow(nominal_closure(robot), robot, timeline, drawing.all_frames)
     drawing.draw_machine(MACHINE, "Machine, nominal", timeline, poses)
     drawing.draw_leg_lines(timeline, poses)
@@ -252,7 +253,7 @@ def _draw_calibration(
         f"{e.drive} {typeset(e.enter * e.edge_factor)} {e.edge_unit}"
         for e in find_entries(calibration)
     )
-    if entries:
+    if entries and assessment_of(calibration).decision.verdict == "enter":
         keep = assessment_of(calibration).keeps_offsets
         which = "Offsets that stay as they are" if keep else "Offsets to enter"
         scene.facts.insert(0, f"{which}: {entries}. Each leg leans by the offsets of all drives.")
@@ -272,13 +273,16 @@ def _place_machines(
     rigid = {n: v for n, v in calibration.errors.items() if robot.parameters.are_rigid(n)}
     machine = robot.with_errors(rigid)
     nominal_loops, real_loops = nominal_closure(robot), LoopClosure(robot, fixed=calibration.errors)
-    timeline = plan_motion([s.drives for s in stops])
-    assumed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)
+    n, motion = len(robot.drives), plan_motion([np.append(s.drives, s.offsets) for s in stops])
+    timeline = Timeline(motion.drives[:, :n], motion.times, motion.stops)
+    expected = motion.drives[:, :n] + motion.drives[:, n:]
+    assumed = Timeline(expected, motion.times, motion.stops)
     nominal = _follow(nominal_loops, robot, assumed, frames)
     real = _follow(real_loops, machine, timeline, frames)
     # the largest deviation includes postures that are not shown
     drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
-    expected = drives + measured.offsets
+    offsets = [measured.active.get(name, measured.offsets) for name in measured.drives]
+    expected = drives + np.array([measured.offsets, *offsets])
     largest, frame = find_largest_shift(
         place_frames(robot, expected, nominal_loops.close(expected), drawing.frames),
         place_frames(machine, drives, real_loops.close(drives), drawing.frames),

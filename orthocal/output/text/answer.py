@@ -46,7 +46,7 @@ from orthocal.output.text.layout import (
 )
 from orthocal.session.session import split_label
 from orthocal.text import printable
-from orthocal.units import DRIVE_UNITS
+from orthocal.units import DRIVE_UNITS, show_limit, tidy
 
 UNCHANGED = "unchanged"
 """Backlash of the controller that keeps its value."""
@@ -290,7 +290,11 @@ def gains_from_correction(calibration: Calibration) -> bool:
 
 
 def calibrate_command(
-    sessions: Sequence[Path], tolerances: Mapping[str, float], *, folder: Path | None = None
+    sessions: Sequence[Path],
+    tolerances: Mapping[str, float],
+    *,
+    folder: Path | None = None,
+    calibration: Calibration | None = None,
 ) -> str:
     """Command that calibrates from several sessions.
 
@@ -299,12 +303,33 @@ def calibrate_command(
         tolerances: Tolerances that differ from those of the robot, by their keys.
         folder: Directory in which the command is typed, if it is that of a session. It is then
             without --out.
+        calibration: Calibration whose model, effects and known values the command repeats.
     """
     paths = sessions if folder is None else [os.path.relpath(s, folder) for s in sessions]
     names = [quote_path(path) for path in paths]
     options = [f"--tolerance {quote_path(f'{key}={value:g}')}" for key, value in tolerances.items()]
+    options += [] if calibration is None else _repeat_choice(calibration)
     out = [f"--out {names[-1]}-calibration"] if folder is None else []
     return " ".join(["orthocal calibrate", *names, *options, *out])
+
+
+def _repeat_choice(calibration: Calibration) -> list[str]:
+    """Options of a command that estimates the same: model, effects and known values."""
+    purpose, robot = calibration.session.purpose, calibration.robot
+    stated = purpose.model if purpose is not None and purpose.model else "full"
+    options = []
+    if calibration.model != stated and calibration.model in robot.parameters.models:
+        options.append(f"--model {quote_path(calibration.model)}")
+    if robot.chosen_effects is not None:
+        options.append(f"--effects {quote_path(','.join(robot.chosen_effects) or 'none')}")
+    for p in calibration.parameters:
+        value = f"{p.name}_{p.edge_unit}={tidy((p.mean if p.free else p.value) * p.edge_factor)}"
+        if not p.free:
+            options.append(f"--known {quote_path(value)}")
+        elif p.prior and p.mean != 0.0:
+            limit = tidy(show_limit(p.prior_std) * p.edge_factor)
+            options.append(f"--known {quote_path(f'{value}±{limit}')}")
+    return options
 
 
 def quote_path(path: str | Path) -> str:

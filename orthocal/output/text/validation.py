@@ -123,7 +123,8 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
     else:
         return []
     stated = validation.final_calibration.robot.parameters.stated
-    command = calibrate_command([Path(path).parent for path in paths if path is not None], stated)
+    sessions = [Path(path).parent for path in paths if path is not None]
+    command = calibrate_command(sessions, stated, calibration=validation.final_calibration)
     return [Text(), render_next(words, [command])]
 
 
