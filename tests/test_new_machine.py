@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -241,10 +242,17 @@ def planned(tmp_path_factory, short_reports, quick_plans):
 
 def test_a_gauge_without_a_tip_has_the_usual_ball(tmp_path):
     """The line between two rods, which the gauge would read without a tip, is empty space."""
-    dial, folder = tmp_path / "dial.yaml", tmp_path / "mill"
+    dial, folder = tmp_path / "dial.yaml", tmp_path / "my mill"
     dial.write_text("sigma_mm: 0.0005\nresolution_mm: 0.001\nrange_mm: [-6, 6]\n")
-    code, _, err = orthocal("new", folder, *options(), "--paper", "--gauge", dial)
+    code, out, err = orthocal("new", folder, *options(), "--paper", "--gauge", dial)
     assert code == 0
+    commands = [shlex.split(line) for line in out.splitlines() if line.startswith("  orthocal ")]
+    assert [words[:3] for words in commands] == [
+        ["orthocal", "new", str(folder)],
+        ["orthocal", "view", str(folder)],
+        ["orthocal", "record", str(folder / "first")],
+        ["orthocal", "calibrate", str(folder / "first")],
+    ]
     assert f"Gauge: ball of 3 mm diameter (not stated in {dial})." in err
     session = load_plan(folder / "first")
     assert {(s.sensor.rod, s.sensor.tip) for s in session.setups.values()} == {("a", USUAL_BALL)}

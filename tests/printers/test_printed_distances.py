@@ -35,6 +35,7 @@ from orthocal import (
     SolverOptions,
     calibrate,
     check_session,
+    export_calibration,
     load_plan,
     load_session,
 )
@@ -218,6 +219,8 @@ def test_distances_determine_the_size_of_prints(printer, session):
         assert 0.9 * before[name].std < after[name].std < before[name].std
     rods = np.array(fit_firmware(after, "klipper").settings.rods) / MM
     assert np.abs(rods - RODS).max() < 2.0
+    text = export_calibration(after, "klipper")["README.md"]
+    assert "Measure a large print" not in text  # it was measured
 
 
 @pytest.mark.parametrize(
