@@ -24,6 +24,7 @@ from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, split_label
+from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 STANDSTILL = 1e-6
@@ -140,9 +141,11 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
         return excess(noise.cycles_sigma, REPEATED)
     if stated is None:
         return words.noise_from_residuals(noise.sigma * calibration.row_factor)
-    if noise.exceeded_by_residuals(stated):
+    floor = noise_floor(stated, gauge.resolution)
+    if noise.exceeded_by_residuals(floor):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
-        return excess(stated, f"the stated scatter of {noun}")
+        rounded = " with rounding" if gauge.resolution else ""
+        return excess(floor, f"the stated scatter of {noun}{rounded}")
     return words.fits(noise.residual_sigma, STATED)
 
 
