@@ -141,11 +141,9 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
         return excess(noise.cycles_sigma, REPEATED)
     if stated is None:
         return words.noise_from_residuals(noise.sigma * calibration.row_factor)
-    floor = noise_floor(stated, gauge.resolution)
-    if noise.exceeded_by_residuals(floor):
+    if noise.exceeded_by_residuals(noise_floor(stated, gauge.resolution)):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
-        rounded = " with rounding" if gauge.resolution else ""
-        return excess(floor, f"the stated scatter of {noun}{rounded}")
+        return excess(stated, f"the stated scatter of {noun}")
     return words.fits(noise.residual_sigma, STATED)
 
 
