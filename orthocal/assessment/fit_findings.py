@@ -24,6 +24,7 @@ from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, split_label
+from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 STANDSTILL = 1e-6
@@ -140,7 +141,7 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
         return excess(noise.cycles_sigma, REPEATED)
     if stated is None:
         return words.noise_from_residuals(noise.sigma * calibration.row_factor)
-    if noise.exceeded_by_residuals(stated):
+    if noise.exceeded_by_residuals(noise_floor(stated, gauge.resolution)):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
         return excess(stated, f"the stated scatter of {noun}")
     return words.fits(noise.residual_sigma, STATED)

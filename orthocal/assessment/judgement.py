@@ -235,9 +235,11 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
     """
     scales = [AS_STATED]
     for part in split_sessions(session):
-        if any(g.sigma is None for g in part.gauges.values()) or len(part.readings) < 2:
+        if len(part.readings) < 2:
             continue
         model = linear_model(part)
+        if not model.stated:
+            continue
         linearisation = model.most_likely(part.values)
         deviation = model.entries(part.values[None])[0] - linearisation.expected
         values = model.problem.observations.values(part.values) / model.problem.noise_ratio

@@ -207,7 +207,7 @@ def _by_model(
     """Findings about deviations before a fit, and about residuals of a fit of offsets."""
     try:
         yield _dimensions(session, problem)
-        if not fit or len(session.gauges) > 1:
+        if not fit or len(session.gauges_with_readings) > 1:
             return
         # one solution: if its residuals are below the stated noise, sigma is the stated one
         options = SolverOptions(solver="variable-projection")
@@ -321,8 +321,7 @@ def _legs(robot: Robot) -> Finding | None:
 
 def name_if_several(session: Session, gauge: str) -> str:
     """Name of a gauge, empty if the readings of the session have no other."""
-    used = {session.setups[r.setup].gauge for r in session.readings}
-    return gauge if len(used) > 1 else ""
+    return gauge if len(session.gauges_with_readings) > 1 else ""
 
 
 def _lengths(robot: Robot) -> dict[str, float]:

@@ -38,7 +38,7 @@ WIDE_BACKLASH = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Repeats:
-    """Readings of one posture with the same approach in one setup, at least two."""
+    """Readings of one place in one setup, at least two; see `Observations.place`."""
 
     rows: Indices
     square: float
@@ -78,7 +78,8 @@ def _list_repeats(session: Session, gauge: str) -> list[_Repeats]:
     variance, values, rows = stated_sigma(session.gauges[gauge]) ** 2, session.values, Rows(session)
     by_hand = rows.written & ~rows.paired
     repeats = []
-    for (setup, *_), repeated in rows.repeated.items():
+    for repeated in group_rows(linear_model(session).problem.observations.row_places).values():
+        setup = session.readings[repeated[0]].setup
         if len(repeated) < 2 or session.setups[setup].gauge != gauge:
             continue
         read = values[repeated]

@@ -127,15 +127,14 @@ def accuracy_rows(
     tool = ToolSensitivity(robot, free=free, values=values, conditions=use)
     nominal = nominal_closure(robot)
     rows, _ = as_rows(points, len(robot.drives), "coordinates")
-    active = calibration.session.controller_offsets
-    offsets = np.zeros(len(robot.drives)) if active is None else np.array(active)
     noise_known = bool(np.isfinite(calibration.model_covariance).all())
     covariance = calibration.error_covariances[0] if noise_known else None
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         drives = nominal.inverse(rows, names=names, failures=failures)
         target = nominal.forward(drives, names=names, failures=failures)
-        commanded = drives - offsets
+        displacement = calibration.displacement(drives, use.approach)
+        commanded = drives - calibration.active_offsets + displacement
         passive = tool.closure.close(commanded, names=names, failures=failures)
         result = np.full((len(rows), 9), np.nan)
         reached = np.array([i for i in range(len(rows)) if i not in failures], dtype=np.int64)

@@ -264,8 +264,8 @@ def list_families(model: LinearModel, rows: Rows, *, grouped: bool) -> Iterator[
         grouped: Whether units and signs of groups of readings are considered.
     """
     if grouped:
-        yield from wrong_units_and_signs(rows, model.sigma)
-    yield from displaced_gauges(rows, model.sigma)
+        yield from wrong_units_and_signs(rows)
+    yield from displaced_gauges(rows)
     yield from wrong_artefacts(model, rows)
     yield from wrong_readings(rows)
     yield from swapped_rows(rows)

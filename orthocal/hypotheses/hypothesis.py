@@ -10,6 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from orthocal.arrays import Array, Indices, Mask
+from orthocal.estimation.weighting import assumed_sigma
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.protocol import reads_pairs, states_readings
@@ -259,6 +260,10 @@ class Rows:
     def gauge(self, row: int) -> Gauge:
         """Gauge of a row."""
         return self.session.gauges[self.session.setups[self.session.readings[row].setup].gauge]
+
+    def sigma(self, row: int) -> float:
+        """Standard deviation of a reading of a row's gauge, as stated or assumed, [m]."""
+        return assumed_sigma(self.gauge(row))
 
     def posture(self, row: int) -> str:
         """Name of the posture of a row, or of the difference of two postures."""

@@ -646,7 +646,6 @@ class _Rows:
     def __init__(self, session: Session, names: tuple[str, ...]) -> None:
         self.session, self.names = session, names
         offsets = session.controller_offsets
-        gauges = {session.setups[r.setup].gauge for r in session.readings}
         same_objects = (
             *(session.robot, session.postures, session.setups, *session.gauges.values()),
             *(session.compensation, session.firmware, session.adjusted, session.path),
@@ -654,7 +653,7 @@ class _Rows:
         self._key = (
             *map(id, same_objects),
             *(None if offsets is None else offsets.tobytes(), session.joined, names),
-            session.values.tobytes() if len(gauges) > 1 else None,
+            session.values.tobytes() if len(session.gauges_with_readings) > 1 else None,
             tuple(
                 (r.setup, r.posture, r.minus, r.cycle, r.line, r.file, r.conditions)
                 for r in session.readings

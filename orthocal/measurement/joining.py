@@ -204,14 +204,19 @@ def split_sessions(session: Session) -> tuple[Session, ...]:
         return (session,)
     label_of = dict(zip(session.setups, session.labels, strict=True))
     labels = dict.fromkeys(label_of[r.setup] for r in session.readings)
-    return tuple(
-        replace(
-            session,
-            setups={name: s for name, s in session.setups.items() if label_of[name] == label},
-            readings=tuple(r for r in session.readings if label_of[r.setup] == label),
+    parts = []
+    for label in labels:
+        setups = {name: s for name, s in session.setups.items() if label_of[name] == label}
+        used = {s.gauge for s in setups.values()}
+        parts.append(
+            replace(
+                session,
+                gauges={name: g for name, g in session.gauges.items() if name in used},
+                setups=setups,
+                readings=tuple(r for r in session.readings if label_of[r.setup] == label),
+            )
         )
-        for label in labels
-    )
+    return tuple(parts)
 
 
 def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:

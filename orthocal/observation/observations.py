@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -85,11 +85,18 @@ class Observations:
     second: Indices
     """Index of the loop closure in the second posture of a pair, or -1, shape (n,)."""
     place: Indices
-    """Index of setup, posture and approach, shape (n,): equal for repeated readings."""
+    """Index of setup, posture, approach and the other stated conditions on which the model depends,
+    shape (n,): equal for repeated readings."""
     conditions: Mapping[Condition, Array]
     """Values of each condition, shape (n, size); neutral where not stated."""
     states: States
     """Loop closures of the entries."""
+
+    @property
+    def row_places(self) -> list[tuple[int, int]]:
+        """Places of the entry of each row and of the one it subtracts, or -1, shape (n_rows,)."""
+        subtracted = np.where(self.minus >= 0, self.place[self.minus], -1)
+        return list(zip(self.place[self.plus].tolist(), subtracted.tolist(), strict=True))
 
     @property
     def n_free_zeros(self) -> int:
@@ -209,7 +216,7 @@ def build_observations(session: Session) -> Observations:
             minus.append(find_or_add(r, r.minus))
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
     values, states, state, second = _observe(session, conditions, table, pairs)
-    places = np.hstack([table[:, :2], values["approach"], second[:, None]])
+    places = np.hstack([table[:, :2], second[:, None], *_repeated_conditions(session, values)])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
     absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
     return Observations(
@@ -335,6 +342,16 @@ def _condition_values(
         rows = np.flatnonzero(setup == k)
         values["time"][rows, 0] = READING_INTERVAL * np.arange(rows.size)
     return values
+
+
+def _repeated_conditions(session: Session, values: Mapping[Condition, Array]) -> Iterator[Array]:
+    """Values of the stated conditions that are equal in repeated readings, shape (n, size) each.
+
+    These are the approach, and temperature and time if an effect of the robot depends on them.
+    """
+    needed = {c for effect in robot_effects(session.robot) for c in effect.conditions}
+    yield values["approach"]
+    yield from (values[c] for c in ("temperature", "time") if c in needed)
 
 
 def _find_loads(session: Session, setup: Indices, posture: Indices) -> Array:

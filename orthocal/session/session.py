@@ -301,10 +301,15 @@ class Session:
         return bool(digest) and self.sha256 == digest
 
     @property
+    def gauges_with_readings(self) -> dict[str, Gauge]:
+        """Name to gauge, of the gauges with readings."""
+        used = {self.setups[r.setup].gauge for r in self.readings}
+        return {name: gauge for name, gauge in self.gauges.items() if name in used}
+
+    @property
     def gauge(self) -> Gauge:
         """The first gauge with readings. The noise of other gauges is stated relative to it."""
-        used = {self.setups[r.setup].gauge for r in self.readings}
-        return ([g for n, g in self.gauges.items() if n in used] or [*self.gauges.values()])[0]
+        return next(iter((self.gauges_with_readings or self.gauges).values()))
 
     def with_gauge(self, gauge: Gauge) -> Session:
         """Session with one gauge for all setups."""

@@ -89,7 +89,8 @@ class Noise:
         """Test for residuals larger than the noise, which shows unmodelled errors.
 
         Args:
-            gauge: Stated standard deviation of a reading, [m]; None if not stated.
+            gauge: Stated standard deviation of a reading with rounding (`noise_floor`), [m]; None
+                if not stated.
 
         Returns:
             None if the noise is known from the residuals only.

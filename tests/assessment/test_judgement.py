@@ -10,7 +10,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED, calibrated, session_of
+from calibrated import UNJUDGED, calibrated, identified, session_of
 from commands import run_orthocal
 from effect_plans import FEW, effect_plan
 
@@ -29,6 +29,7 @@ from orthocal import (
     write_session,
 )
 from orthocal.assessment import judgement as judgement_module
+from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.wording import describe_actions
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
@@ -36,6 +37,7 @@ from orthocal.output.text.answer import render_decision
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import result_json
 from orthocal.session.session import Conditions
+from orthocal.statistics.noise import noise_floor
 
 QUICK = {"solver": "variable-projection"}
 
@@ -328,6 +330,22 @@ def test_readings_are_compared_with_the_resolution_of_their_gauge(workshop):
     values = (np.round(workshop.values / steps) + odd) * steps
     both = replace(workshop, gauges=gauges, setups=setups).with_values(values)
     assert "finer than the gauge" not in {f.kind for f in judge_session(both).findings}
+
+
+def test_residuals_are_compared_with_the_stated_noise_and_rounding():
+    """Half a step as noise: rounding adds a third to the variance and is no error of the model."""
+    plan = session_of("sweep").with_gauge(Gauge(5e-6, 10e-6, None))
+    floor = noise_floor(5e-6, 10e-6)
+    for seed in range(6):
+        session = simulate_session(plan, {"x_slide.offset": 0.1e-3}, seed=seed).session
+        calibration = identified(session, "offsets")
+        assert 5e-6 < calibration.gauges[0].noise.residual_sigma < 1.15 * floor
+        assert "model error" not in {f.kind for f in find_fit_findings(calibration)}
+    errors = {"x_slide.offset": 0.1e-3, "x_slide.rz": 1e-3, "y_swivel.rx": 1e-3}
+    calibration = identified(simulate_session(plan, errors, seed=1).session, "offsets")
+    (excess,) = (f for f in find_fit_findings(calibration) if f.kind == "model error")
+    assert calibration.gauges[0].noise.residual_sigma > 1.15 * floor
+    assert "the stated scatter of the gauge (0.005 mm)" in excess.text
 
 
 def test_the_tool_error_is_that_of_the_accuracy():

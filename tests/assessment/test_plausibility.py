@@ -185,6 +185,15 @@ def test_a_sigma_in_micrometres_is_found(cycles):
     assert "sigma too large" not in kinds(same)
 
 
+def test_a_sigma_that_is_too_large_is_found_in_each_of_joined_sessions(cycles):
+    """A gauge that read nothing does not hide it."""
+    coarse = cycles.with_gauge(replace(cycles.gauge, sigma=10e-3))
+    gauges = {**coarse.gauges, "spare": replace(coarse.gauge, sigma=None)}
+    assert kinds(replace(coarse, gauges=gauges)).count("sigma too large") == 1
+    both = join_sessions([coarse, replace(coarse, sha256="")])
+    assert kinds(both).count("sigma too large") == 2
+
+
 def near(session, name, other):
     """The session with a posture 0.05 mm per drive from another one."""
     moved = replace(session.postures[name], drives=session.postures[other].drives + 0.05e-3)

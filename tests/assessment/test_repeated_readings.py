@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import timedelta
 
 import numpy as np
 import pytest
 from conftest import ROOT
+from effect_plans import FIRST, effect_plan
 from models import TRUTH
 from planned import quick_plan
 
@@ -23,11 +25,14 @@ from orthocal import (
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
 from orthocal.effects.compensation import JointTrim
+from orthocal.estimation.problem import build_problem
 from orthocal.estimation.weighting import usual_difference
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.session.session import Conditions, Gauge
+from orthocal.statistics.noise import estimate_repeatability
 
 KIND = "differing closing reading"
+HOUR = timedelta(hours=1)
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +133,39 @@ def test_the_setup_is_read_again_unless_other_offsets_are_active(sound, tmp_path
 
 
 BACKLASHES = {"x_slide.backlash": 40e-6, "y_slide.backlash": 55e-6, "z_slide.backlash": 30e-6}
+
+
+@pytest.mark.parametrize("effect", ["thermal", "drift"])
+def test_readings_under_conditions_on_which_the_model_depends_repeat_under_equal_ones(effect):
+    """Differences by temperature or time are no scatter if an effect of the model causes them."""
+    rng = np.random.default_rng(3)
+
+    def read(cycles):
+        """Session and problem of the plan, read at each temperature and hour."""
+        plan = effect_plan(effect)
+        readings = tuple(
+            replace(r, cycle=cycle, conditions=Conditions(r.approach, celsius, FIRST + hour * HOUR))
+            for cycle, (celsius, hour) in enumerate(cycles, start=1)
+            for r in plan.readings
+        )
+        problem = build_problem(replace(plan, readings=readings), model="full", prior=True)
+        theta = problem.active_theta.copy()
+        for i, name in enumerate(problem.free):
+            if name.endswith((".expansion", ".drift")):
+                theta[i] += 2.0 * problem.theta_scale[i]
+        noise = problem.session.gauge.sigma * rng.normal(size=problem.observations.size)
+        rows = problem.observations.rows(problem.predict(theta) + noise)
+        return problem.session.with_values(rows), problem.observations
+
+    session, observations = read([(19.0, 0), (29.0, 2)])
+    assert estimate_repeatability(session.values, observations)[1] == 0
+    assert find_scattered(session) == ()
+    without = session.with_effects([])
+    assert [f.kind for f in find_scattered(without)] == ["scattered repeats"]
+    session, observations = read([(19.0, 2), (29.0, 0), (19.0, 2)])
+    sigma, dof = estimate_repeatability(session.values, observations)
+    assert dof == len(session.readings) // 3
+    assert sigma == pytest.approx(session.gauge.sigma, rel=0.2)
 
 
 @pytest.fixture(scope="module")

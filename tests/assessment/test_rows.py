@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from calibrated import UNJUDGED
 from commands import run_orthocal
+from effect_plans import effect_plan
 
-from orthocal import assess_tool, calibrate
+from orthocal import assess_tool, calibrate, simulate_session
 from orthocal.assessment import tool_tables as module
 from orthocal.assessment.tool_error import Workspace
 from orthocal.assessment.tool_tables import (
@@ -21,6 +23,8 @@ from orthocal.assessment.tool_tables import (
     row_blocks,
 )
 from orthocal.calibration.file import write_calibration
+from orthocal.effects.compensation import JointTrim
+from orthocal.kinematics.conditions import UseConditions
 
 OUT_OF_REACH = [0.0, 0.0, 0.9]
 BEYOND_TRAVEL = [0.1, 0.0, 0.0]
@@ -29,6 +33,15 @@ BEYOND_TRAVEL = [0.1, 0.0, 0.0]
 @pytest.fixture(scope="module")
 def calibration(experiment_2):
     return calibrate(experiment_2, **UNJUDGED)
+
+
+@pytest.fixture(scope="module")
+def compensated():
+    """Calibration of a machine whose controller compensates another backlash than it has."""
+    trims = tuple(JointTrim(amount) for amount in (0.1e-3, 0.06e-3, 0.02e-3))
+    plan = replace(effect_plan("backlash"), compensation=trims)
+    errors = {"x_slide.backlash": 0.03e-3, "y_slide.offset": 0.2e-3}
+    return calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +76,16 @@ def test_chunks_equal_all_rows_at_once(calibration, points):
     sigma = np.sqrt(np.diagonal(whole.after.covariance, axis1=1, axis2=2))
     expected = np.hstack([whole.targets, whole.deviation, sigma])
     assert found == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("approach", ["ppp", "nnn", "pnp"])
+def test_rows_of_a_compensated_machine_are_those_of_the_tool_error(compensated, points, approach):
+    conditions = UseConditions(approach=approach)
+    whole = assess_tool(compensated, Workspace.even(points), conditions=conditions)
+    expected = np.sqrt(np.diagonal(whole.after.covariance, axis1=1, axis2=2))
+    found = joined(accuracy_rows(compensated, points, conditions=conditions))
+    assert found[:, 3:6] == pytest.approx(whole.deviation, abs=1e-12)
+    assert found[:, 6:] == pytest.approx(expected, rel=1e-3)  # linearised elsewhere
 
 
 @pytest.mark.parametrize("table", [inverse_rows, accuracy_rows])

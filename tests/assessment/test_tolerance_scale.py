@@ -12,9 +12,10 @@ from linear_machines import LinearMachines
 from scaled_machines import calibrate_machines
 from scipy.stats import binom
 
-from orthocal import Choice, assess_tool, calibrate, compare_models
+from orthocal import Choice, assess_tool, calibrate, compare_models, join_sessions
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import compute_entries, expanded_uncertainty
+from orthocal.assessment.judgement import find_tolerance_scale
 from orthocal.calibration.file import load_calibration, write_calibration
 from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import repeat_calibration, repeat_fit, restore_session
@@ -51,6 +52,18 @@ def test_priors_of_the_geometry_are_scaled_but_not_those_of_offsets(full):
     for p in full.free:
         expected = known[p.name].prior_std * (1.0 if known.are_offsets(p.name) else factor)
         assert p.prior_std == pytest.approx(expected)
+
+
+def test_a_noise_that_is_not_stated_concerns_the_readings_of_its_gauge_alone(session):
+    """Neither a gauge that read nothing nor one of another session changes the tolerance scale."""
+    alone = find_tolerance_scale(session)
+    spare = replace(session.gauge, sigma=None)
+    with_spare = replace(session, gauges={**session.gauges, "spare": spare})
+    assert find_tolerance_scale(with_spare) == alone
+    other = session_of("table1/experiment-3")
+    unstated = other.with_gauge(replace(other.gauge, sigma=None))
+    assert find_tolerance_scale(unstated).factor == 1.0
+    assert find_tolerance_scale(join_sessions([session, unstated])) == alone
 
 
 def test_the_stated_uncertainty_of_a_known_value_is_not_scaled(session):

@@ -11,6 +11,7 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.families.unit_and_sign import factor_family
+from orthocal.hypotheses.families.wrong_readings import inconsistent_groups
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.search import find_anomalies
 
@@ -49,6 +50,16 @@ def test_the_scale_of_readings_changes_their_density_in_each_free_direction(root
     family = factor_family(rows, groups)
     expected = [len(rows.setups[dial]) - 1, len(rows.setups["bar_xy"])]
     assert family.log_volume == pytest.approx(np.array(expected) * np.log(25.4))
+
+
+def test_an_inconsistent_setup_has_an_amount_for_each_place_but_one_for_a_free_zero(root, tmp_path):
+    """A known zero takes none of the amounts of a bar."""
+    rows = Rows(with_bar(root, tmp_path, "raw-cycles", ["xy"]))
+    family = next(inconsistent_groups(rows))
+    amounts = {family.explain(h).setups[0]: len(family.groups[h]) for h in range(family.count)}
+    places = {n: len({rows.session.readings[i].place for i in r}) for n, r in rows.setups.items()}
+    assert amounts.pop("bar_xy") == places.pop("bar_xy") == 8
+    assert amounts == {name: count - 1 for name, count in places.items()}
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_
 from planned import quick_plan
 
 from orthocal import (
+    Gauge,
     Orthoglide,
     check_session,
     draw_errors,
@@ -73,7 +74,7 @@ def test_an_edit_corrects_the_mistake(sheet, name):
     rows = Rows(sheet.session.with_values(made.values))
     families = [
         *wrong_readings(rows),
-        *wrong_units_and_signs(rows, sheet.noise),
+        *wrong_units_and_signs(rows),
         *swapped_rows(rows),
     ]
     best = min(
@@ -130,7 +131,7 @@ def test_a_setup_that_no_hypothesis_explains_is_named(cycles):
 def test_closing_reading_is_no_cycle_of_its_own(cycles, closing):
     """All other readings of its setup are no group beside the setup, either."""
     rows = [r for r in cycles.readings if r.setup == "yx"][: 3 + closing]
-    families = wrong_units_and_signs(Rows(cycles.select(rows)), cycles.gauge.sigma)
+    families = wrong_units_and_signs(Rows(cycles.select(rows)))
     scopes = {f.explain(h).scope for f in families for h in range(f.count)}
     assert ("cycle" in scopes) == (closing > 1)
 
@@ -152,6 +153,59 @@ def test_a_reading_swapped_with_the_closing_one_is_named(seed, row, kind):
     assert found.kind == kind
     assert {p.posture for p in found.places} == {one.posture, other.posture}
     assert f"{one.setup} {one.posture} and {other.setup} {other.posture}" in found.text
+
+
+def two_gauges(session, noises, setups):
+    """Session whose listed setups are read by a second gauge; noises are by name, the first first.
+
+    Args:
+        session: The session.
+        noises: Standard deviation of a reading of "dial" and "other", in the order of the gauges.
+        setups: Setups of "other".
+    """
+    return replace(
+        session,
+        gauges={name: Gauge(sigma, None, None) for name, sigma in noises.items()},
+        setups={
+            n: replace(s, gauge="other" if n in setups else "dial")
+            for n, s in session.setups.items()
+        },
+    )
+
+
+@pytest.mark.parametrize("first", ["dial", "other"])
+def test_corrected_steps_are_compared_with_the_noise_of_their_gauge(cycles, first):
+    """A gauge in thousandths of an inch, written as mm, beside a dial of a micrometre."""
+    once = cycles.select([r for r in cycles.readings if r.cycle == 1])
+    noises = {"dial": 1e-6, "other": 13e-6}
+    session = two_gauges(once, {first: noises[first], **noises}, ("yx", "zx"))
+    of_other = np.array([r.setup in ("yx", "zx") for r in once.readings])
+    inches = np.round(once.values / 25.4e-6) * 1e-6
+    session = session.with_values(np.where(of_other, inches, once.values))
+    tested = {
+        (e.kind, e.factor)
+        for family in wrong_units_and_signs(Rows(session))
+        for e in map(family.explain, range(family.count))
+        if e.rows == tuple(np.flatnonzero(of_other))
+    }
+    assert ("wrong unit", 25.4) in tested
+    assert ("wrong unit", 1e3) not in tested  # no gauge of 13 um is read in steps of 1 mm
+
+
+def test_the_evidence_of_a_stuck_dial_does_not_depend_on_the_order_of_the_gauges(cycles):
+    rows = [i for i, r in enumerate(cycles.readings) if r.setup == "xz"]
+    values = cycles.values
+    values[rows[2]] = values[rows[1]]
+    noises, found = {"dial": 2e-6, "other": 0.1e-3}, []
+    for first in noises:
+        session = two_gauges(cycles, {first: noises[first], **noises}, ("yx", "zx"))
+        found += [
+            family.log_volume[h]
+            for family in displaced_gauges(Rows(session.with_values(values)))
+            for h in range(family.count)
+            if (family.explain(h).kind, family.explain(h).names) == ("stuck dial", ("xz",))
+        ]
+    assert found == pytest.approx([-np.log(2e-6)] * 2)
 
 
 def test_a_sigma_in_a_wrong_unit_is_the_only_finding(cycles):
@@ -244,7 +298,7 @@ def test_products_by_cumulative_sums_are_those_of_dense_patterns(name):
     about = model.linearise(np.zeros(model.problem.n_free), (), None, keep_jacobian=False)
     deviation = model.entries(session.values[None])[0] - about.expected
     tested = 0
-    for family in (*displaced_gauges(rows, model.sigma), *row_offsets(rows)):
+    for family in (*displaced_gauges(rows), *row_offsets(rows)):
         for patterns in (family.edits, family.effects):
             if patterns is None or patterns.tails is None:
                 continue

@@ -65,6 +65,6 @@ def test_numbers_of_triggers_have_no_units_signs_or_rows(tmp_path, heights):
     log = tmp_path / "log.txt"
     log.write_text(write_log("klipper", nominal(), rings(), heights, -TRIGGER_MM))
     rows = Rows(import_printer_log(log).session)
-    families = [*wrong_units_and_signs(rows, 1e-5), *row_offsets(rows), *swapped_rows(rows)]
+    families = [*wrong_units_and_signs(rows), *row_offsets(rows), *swapped_rows(rows)]
     assert not families
     assert [f.explain(0).kind for f in wrong_readings(rows)] == ["outlier"]

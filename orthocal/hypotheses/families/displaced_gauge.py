@@ -24,14 +24,9 @@ MAX_STUCK = 16
 """Most readings of a run of equal ones that are used."""
 
 
-def displaced_gauges(rows: Rows, sigma: float) -> Iterator[Family]:
-    """Gauges displaced within a setup or for one cycle, stuck dials.
-
-    Args:
-        rows: The rows.
-        sigma: Standard deviation of a reading, [m].
-    """
-    for family in (_displaced(rows), _cycle_apart(rows), _stuck(rows, sigma)):
+def displaced_gauges(rows: Rows) -> Iterator[Family]:
+    """Gauges displaced within a setup or for one cycle, stuck dials."""
+    for family in (_displaced(rows), _cycle_apart(rows), _stuck(rows)):
         if family is not None:
             yield family
 
@@ -74,7 +69,7 @@ def _cycle_apart(rows: Rows) -> Family | None:
     return Family.with_effects(rows, explanations) if explanations else None
 
 
-def _stuck(rows: Rows, sigma: float) -> Family | None:
+def _stuck(rows: Rows) -> Family | None:
     """Runs of equal readings of different postures; all but the first carry no information."""
     runs: list[Indices] = []
     for indices in rows.setups.values():
@@ -95,6 +90,7 @@ def _stuck(rows: Rows, sigma: float) -> Family | None:
         for run, setup in zip(runs, setups, strict=True)
     ]
     silent = [run[1 : MAX_STUCK + 1] for run in runs]
-    steps = np.array([rows.gauge(int(run[0])).resolution or sigma for run in runs])
+    firsts = [int(run[0]) for run in runs]
+    steps = np.array([rows.gauge(i).resolution or rows.sigma(i) for i in firsts])
     volume = -np.log(steps) * [len(indices) for indices in silent]
     return Family.of(explanations, size=rows.count * MAX_STUCK, log_volume=volume, silent=silent)

@@ -39,14 +39,10 @@ MAX_PAIRED_SETUPS = 24
 """Number of setups of a session above which pairs of setups are not tested."""
 
 
-def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
+def wrong_units_and_signs(rows: Rows) -> Iterator[Family]:
     """Hypotheses that all readings of a group have a wrong unit, decimal point or sign.
 
     A cycle may have a wrong unit or decimal point only.
-
-    Args:
-        rows: The rows.
-        sigma: Standard deviation of a reading, [m].
     """
     groups = [g for g in _groups(rows) if rows.written[list(g.rows)].all()]
     if not groups:
@@ -62,8 +58,8 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
         for (name, cycle), indices in rows.cycles.items()
         if name in names and 1 < len(indices) < len(rows.setups[name]) - 1
     ]
-    yield _scaled(rows, groups, "wrong unit", UNITS, sigma)
-    yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
+    yield _scaled(rows, groups, "wrong unit", UNITS)
+    yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS)
 
 
 def factor_family(
@@ -141,18 +137,20 @@ def _scaled(
     groups: Sequence[Explanation],
     kind: AnomalyKind,
     factors: tuple[float, ...],
-    sigma: float,
 ) -> Family:
     """Family of groups multiplied by each factor after which the decimal step is plausible.
 
-    Factors below 1 are not tested: they make the step finer.
+    The step is compared with the largest noise of the gauges of a group. Factors below 1 are not
+    tested: they make the step finer.
     """
     of_rows = decimal_steps(rows.values)
+    noise_of_rows = np.array([rows.sigma(i) for i in range(rows.count)])
     steps = [of_rows[list(g.rows)].min() for g in groups]
+    sigmas = [noise_of_rows[list(g.rows)].max() for g in groups]
     explanations = [
         replace(g, kind=kind, factor=factor)
         for factor in factors
-        for g, step in zip(groups, steps, strict=True)
+        for g, step, sigma in zip(groups, steps, sigmas, strict=True)
         if factor < 1.0 or MIN_RELATIVE_STEP * sigma <= factor * step <= MAX_RELATIVE_STEP * sigma
     ]
     return factor_family(rows, explanations, size=len(groups) * len(factors))

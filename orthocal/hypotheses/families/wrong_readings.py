@@ -96,7 +96,7 @@ def _inconsistent_setups(rows: Rows) -> Family | None:
     explanations, groups = [], []
     for name, indices in rows.setups.items():
         amounts = [r for (setup, *_), r in rows.repeated.items() if setup == name]
-        if rows.single[indices].all():  # the gauge zero is free
+        if rows.single[indices].all() and rows.session.setups[name].zero == "free":
             amounts = amounts[1:]
         if 1 < len(amounts) <= MAX_AMOUNTS:
             concerned = tuple(indices.tolist())
