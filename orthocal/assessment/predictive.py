@@ -36,7 +36,7 @@ from orthocal.statistics.distributions import (
     median_of_largest,
 )
 from orthocal.statistics.noise import FEW_DOF, noise_floor
-from orthocal.statistics.zeros import project_out_zeros
+from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
 MAX_STEPS = 12
 """Largest number of Gauss-Newton steps to the least χ²."""
@@ -304,9 +304,7 @@ def _expect_with_priors(calibration: Calibration, fit: Fit, noise: Array) -> Exp
     def rows(entries: Array) -> Array:
         return o.rows((entries.T * noise).T)
 
-    # a mean over n entries with one zero has 1/n of the variance of an entry
-    share = np.where(o.zero_known, 0.0, 1.0 / np.bincount(o.zero, minlength=o.n_zeros))[o.zero]
-    single = o.minus < 0
+    share, single = zero_shares(o)[o.zero], o.minus < 0
     variances = noise[o.plus] ** 2 * np.where(single, 1.0 - share[o.plus], 1.0)
     variances += np.where(single, 0.0, noise[o.minus] ** 2)
     of_mounting = rows(mounting)
