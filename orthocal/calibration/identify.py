@@ -28,6 +28,7 @@ from orthocal.observation.observations import require_conditions
 from orthocal.session.completeness import require_complete
 from orthocal.session.session import Session
 from orthocal.statistics.identifiability import find_base_parameters
+from orthocal.statistics.information import marginalise
 
 MAX_BASE_ROUNDS = 8
 
@@ -131,7 +132,7 @@ def _fit_base(
     sigma = first_sigma(problem, split_by_gauge(problem.session, problem.observations))
     base_names: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
-        factor = information.factor[:, : problem.n_machine]
+        factor = marginalise(information, problem.n_machine, sigma=sigma).factor
         machine = problem.machine_selection.parameters
         combinations = find_base_parameters(factor, machine, threshold=sigma)
         if not combinations:

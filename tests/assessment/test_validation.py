@@ -42,7 +42,7 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
-from orthocal.assessment.validation import ENTRY_KINDS
+from orthocal.assessment.validation import ENTRY_KINDS, _with_active_offsets
 from orthocal.assessment.wording import join_texts
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -225,6 +225,17 @@ def test_only_identified_offsets_must_be_active(experiment_3):
     entered = np.add(entered_offsets(calibration), [0.0, 0.3e-3, 1e-3])
     with pytest.raises(SessionError, match=r"controller\.offsets_mm: z_slide has"):
         validate_calibration(calibration, experiment_3.with_controller(entered))
+
+
+def test_a_session_without_stated_offsets_has_the_offsets_after_the_entries(raw_cycles):
+    """A drive whose offset the calibration does not identify keeps the one while measuring."""
+    active = [0.2e-3, -0.1e-3, 1e-3]
+    choice = Choice(free=["x_slide.offset", "y_slide.offset"])
+    calibration = calibrate(raw_cycles.with_controller(active), choice, **UNJUDGED)
+    new = replace(raw_cycles, controller_offsets=None)
+    assumed = _with_active_offsets(calibration, new).active_offsets
+    assert assumed[2] == active[2]
+    assert assumed.tolist() == entered_offsets(calibration).tolist()
 
 
 def test_sessions_of_the_calibration_are_refused(experiment_3):
