@@ -147,7 +147,7 @@ def _assess_tool(calibration: Calibration) -> ToolAccuracy | None:
 def _effective_parameters(fit: Fit) -> float:
     """Effective number of parameters of a fit."""
     return fit.information.posterior(
-        sigma=fit.sigma, precision=fit.problem.prior_precision
+        sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
     ).effective_parameters
 
 

@@ -244,6 +244,14 @@ def test_criteria_of_several_gauges_solved_by_hand():
     assert result.exact.bic == pytest.approx(misfit + k * math.log(n), rel=1e-7)
 
 
+def test_a_parameter_at_a_bound_is_no_effective_one(raw_cycles):
+    problem = build_problem(raw_cycles, model="offsets", bounds={"x_slide.offset": (0.0, 0.05e-3)})
+    result = score_model(problem, noises=find_known_noises(raw_cycles), options=QUICK)
+    assert result.calibration.free[0].at_bound == "upper"
+    assert result.effective == pytest.approx(2.0, abs=0.01)
+    assert result.exact.dof == pytest.approx(result.calibration.noise.residual_dof)
+
+
 def test_known_noise_includes_the_rounding_of_the_gauge():
     """Readings that are rounded to 10 µm scatter by 2.9 µm in addition to the stated 5 µm."""
     session = replace(session_of("sweep"), gauges={"": Gauge(5e-6, 10e-6)})
