@@ -129,7 +129,8 @@ def _fit_base(
     base parameters do not change.
     """
     information = linearise_problem(with_initial_noise(problem)).information
-    sigma = first_sigma(problem, split_by_gauge(problem.session, problem.observations))
+    groups = split_by_gauge(problem.session, problem.observations)
+    sigma = first_sigma(problem, groups)
     base_names: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
         factor = marginalise(information, problem.n_machine, sigma=sigma).factor
@@ -147,6 +148,9 @@ def _fit_base(
         reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(base_names))
         fit = fit_problem(reduced, options=options, start=start)
         sigma = max(fit.sigma, sigma)  # no more parameters than before
+        if len(groups) > 1:
+            weighted = problem.with_noise_ratio(fit.problem.noise_ratio)
+            information = linearise_problem(weighted).information
     return fit
 
 
