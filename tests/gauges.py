@@ -1,8 +1,10 @@
-"""Gauges of tests that are about the machine alone: known exactly, where and how they stand."""
+"""Gauges of tests: known exactly, or of different noise."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+
+import numpy as np
 
 from orthocal.sensors.mounting import EXACT
 
@@ -16,3 +18,30 @@ def exact(session):
         for name, s in session.setups.items()
     }
     return replace(session, setups=setups)
+
+
+def with_gauges(session, gauges, fine_setups):
+    """The same session with two gauges, by name: "fine" of some setups and "coarse" of the others.
+
+    The first gauge of the session is the first of `gauges`.
+    """
+    setups = {
+        name: replace(s, gauge="fine" if name in fine_setups else "coarse")
+        for name, s in session.setups.items()
+    }
+    return replace(session, gauges=gauges, setups=setups)
+
+
+def with_scatter(session, theta, problem, rng):
+    """The session with readings of a machine, each with the stated noise of its gauge.
+
+    Args:
+        session: Setups and postures.
+        theta: Free parameters of the machine, shape (n_free,), [SI].
+        problem: Problem of the session with these parameters.
+        rng: Source of the scatter.
+    """
+    sigmas = [session.gauges[s.gauge].sigma for s in session.setups.values()]
+    scatter = rng.normal(size=problem.observations.size)
+    entries = problem.predict(theta) + scatter * np.array(sigmas)[problem.observations.setup]
+    return session.with_values(problem.observations.rows(entries))

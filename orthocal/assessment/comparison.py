@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,11 +23,12 @@ from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.estimation.weighting import split_by_gauge, with_repeatability
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions, require_same_robot
 from orthocal.session.session import Session
-from orthocal.statistics.noise import KnownNoise, estimate_repeatability
+from orthocal.statistics.noise import Noise, estimate_noise
 
 CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "prediction_rms")
 """Numbers of a score in the JSON document."""
@@ -41,8 +41,8 @@ class Comparison:
     title: str
     labels: tuple[str, ...]
     """Labels of the readings, with the cycle if there are several."""
-    noise: KnownNoise
-    """Noise with which residuals are compared."""
+    noises: Mapping[str, Noise]
+    """Noise of each gauge with which residuals are compared."""
     independent: int
     """Independent readings: distinct readings minus gauge zeros."""
     results: tuple[ModelResult, ...]
@@ -91,10 +91,12 @@ class Comparison:
         """Comparison as a JSON document, SI units."""
         recommendation = self.recommendation
         document = {
-            "schema": "orthocal/comparison/5",
+            "schema": "orthocal/comparison/6",
             "title": self.title,
-            "noise": finite_or_none(self.noise.sigma),
-            "noise_source": self.noise.source,
+            "noises": [
+                {"gauge": name, "sigma": finite_or_none(noise.sigma), "source": noise.source}
+                for name, noise in self.noises.items()
+            ],
             "independent_readings": self.independent,
             "models": [_result_document(r) for r in self.results],
             "undetermined": [
@@ -148,18 +150,18 @@ def compare_models(
     gathered = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
-    names, noise = _require_models(session, models), find_known_noise(session)
+    names, noises = _require_models(session, models), find_known_noises(session)
     if judgement is None:
         report("searching the readings for anomalies")
     judgement = judgement_of(session, judgement)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
-    results, undetermined = _score_models(build, names, noise.sigma, options, report)
+    results, undetermined = _score_models(build, names, noises, options, report)
     if judgement.verdict != "enter":
         results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)
     comparison = Comparison(
         title=session.title,
         labels=_label_rows(session),
-        noise=noise,
+        noises=noises,
         independent=results[0].redundancy + results[0].rank if results else 0,
         results=results,
         undetermined=undetermined,
@@ -209,7 +211,7 @@ def _label_rows(session: Session) -> tuple[str, ...]:
 def _score_models(
     build: Callable[..., CalibrationProblem],
     models: Sequence[str],
-    noise: float,
+    noises: Mapping[str, Noise],
     options: SolverOptions | None,
     report: Callable[[str], None],
 ) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
@@ -217,7 +219,7 @@ def _score_models(
     results, undetermined = [], []
     for model in dict.fromkeys(models):
         report(f"identifying model {model}, and predicting each setup from the others")
-        result = _score_with_prior(partial(build, model=model), noise, options)
+        result = _score_with_prior(partial(build, model=model), noises, options)
         if isinstance(result, Undetermined):
             undetermined.append(result)
         else:
@@ -226,7 +228,9 @@ def _score_models(
 
 
 def _score_with_prior(
-    build: Callable[..., CalibrationProblem], noise: float, options: SolverOptions | None
+    build: Callable[..., CalibrationProblem],
+    noises: Mapping[str, Noise],
+    options: SolverOptions | None,
 ) -> ModelResult | Undetermined:
     """Score a model, with its tolerances as a prior if the readings alone do not determine it.
 
@@ -234,11 +238,11 @@ def _score_with_prior(
     """
     problem = build()
     try:
-        return score_model(problem, noise=noise, options=options)
+        return score_model(problem, noises=noises, options=options)
     except NotIdentifiableError:
         with_prior = build(prior=True)
     try:
-        return score_model(with_prior, noise=noise, by_choice=False, options=options)
+        return score_model(with_prior, noises=noises, by_choice=False, options=options)
     except NotIdentifiableError as e:
         return Undetermined(problem.selection.label, problem.n_machine, e.problem)
 
@@ -326,15 +330,20 @@ def _require_another(other: Session, sessions: Sequence[Session]) -> None:
             )
 
 
-def find_known_noise(session: Session) -> KnownNoise:
-    """Noise of a reading without any model: scatter between cycles, otherwise as stated."""
+def find_known_noises(session: Session) -> dict[str, Noise]:
+    """Noise of each gauge without any model: scatter between cycles, at least as stated."""
     problem = build_problem(session, free=["*.offset"])
-    sigma, dof = estimate_repeatability(problem.values, problem.observations)
-    if dof > 0 and sigma > 0.0:
-        return KnownNoise(sigma, "cycles")
-    if session.gauge.sigma is not None:
-        return KnownNoise(session.gauge.sigma, "gauge")
-    return KnownNoise(math.nan, "unknown")
+    groups = split_by_gauge(session, problem.observations)
+    return {
+        g.name: estimate_noise(
+            repeatability=g.repeatability,
+            residual_square=0.0,
+            residual_dof=0.0,
+            gauge_sigma=g.gauge.sigma,
+            resolution=g.gauge.resolution,
+        )
+        for g in with_repeatability(groups, problem)
+    }
 
 
 def _effects_document(comparison: EffectComparison) -> dict[str, Any]:

@@ -6,6 +6,7 @@ All are notes, except that an offset at a stated bound must be reviewed.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
+from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
@@ -195,19 +197,23 @@ def find_unresolved(calibration: Calibration) -> list[Finding]:
 
 def _idealisation(calibration: Calibration) -> list[Finding]:
     """Finding about gauges that may touch a rod but are modelled by the centre line of the leg."""
-    sigma = calibration.noise.sigma
+    sigmas = {g.name: g.noise.sigma for g in calibration.gauges}
+    session = restore_session(calibration)
     try:
-        idealised = find_idealised(restore_session(calibration))
+        idealised = find_idealised(session, sigmas)
     except (ClosureError, RobotError):  # reported by the finding about the tool error
         return []
-    if idealised is None or not idealised.size > NOTABLE_IDEALISATION * sigma:
+    if idealised is None:
+        return []
+    sigma = sigmas[session.setups[idealised.setup].gauge]
+    if not idealised.size > NOTABLE_IDEALISATION * sigma:
         return []
     return [words.line_assumed(idealised.size, idealised.setup, idealised.touches, sigma)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Idealised:
-    """Largest difference between the line model and a rod that the gauge may touch."""
+    """Largest difference between the line model and a rod that the gauge may touch, in its σ."""
 
     setup: str
     """Setup with the largest difference."""
@@ -218,8 +224,13 @@ class Idealised:
     [m]."""
 
 
-def find_idealised(session: Session) -> Idealised | None:
-    """Largest difference between readings of the line model and of a rod; None without such."""
+def find_idealised(session: Session, sigmas: Mapping[str, float]) -> Idealised | None:
+    """Largest difference between readings of the line model and of a rod; None without such.
+
+    Args:
+        session: The session.
+        sigmas: Standard deviation of a reading of each gauge, [m]; NaN if unknown.
+    """
     rod_sensors = {
         name: sensors
         for name, s in session.setups.items()
@@ -236,7 +247,8 @@ def find_idealised(session: Session) -> Idealised | None:
     setups = {n: replace(s, sensor=rod_sensors[n][rods[n]]) for n, s in part.setups.items()}
     difference = _nominal_expansion(replace(part, setups=setups)) - _nominal_expansion(part)
     sizes = np.linalg.norm(difference, axis=1)
-    worst = int(sizes.argmax())
+    sigma = np.array([sigmas[session.setups[r.setup].gauge] for r in readings])
+    worst = int(np.nan_to_num(sizes / np.maximum(sigma, SMALLEST_SIGMA)).argmax())
     setup = readings[worst].setup
     return Idealised(setup, rods[setup], float(sizes[worst]))
 

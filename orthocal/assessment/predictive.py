@@ -36,7 +36,7 @@ from orthocal.statistics.distributions import (
     median_of_largest,
 )
 from orthocal.statistics.noise import FEW_DOF, noise_floor
-from orthocal.statistics.zeros import project_out_zeros
+from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
 MAX_STEPS = 12
 """Largest number of Gauss-Newton steps to the least χ²."""
@@ -125,18 +125,23 @@ def _predict_noise(calibration: Calibration, fit: Fit) -> _PredictedNoise:
 
     That of a gauge of the calibration is as estimated there. It contains unmodelled errors, without
     priors always the residuals. Another gauge has its stated noise and the same unmodelled errors.
-    Degrees of freedom of several gauges are combined as Satterthwaite (1946) does.
+    Degrees of freedom of several gauges are combined as Satterthwaite (1946) does. A noise that
+    gauges share counts once.
     """
     sigma, inverse_dof = np.empty(fit.problem.observations.size), 0.0
+    by_residuals = True
     for group, own in zip(fit.groups, fit.noises.gauges, strict=True):
         stated = group.gauge.sigma, group.gauge.resolution
         known = [k for k in calibration.gauges if (k.sigma, k.resolution) == stated]
         if known:
             found = [_of_calibration(calibration, k) for k in known]
             variance = sum(s**2 for s, _ in found) / len(found)
-            dof = sum(dof for _, dof in found)
+            dof = sum(dof for _, dof in set(found))
+            by_residuals &= not calibration.prior or all(
+                k.noise.source == "residuals" for k in known
+            )
         else:
-            separate, dof = noise_floor(*stated), math.inf
+            by_residuals, separate, dof = False, noise_floor(*stated), math.inf
             if own.cycles_dof >= FEW_DOF:
                 separate, dof = own.without_residuals(*stated)
             if not separate > 0.0:
@@ -150,7 +155,8 @@ def _predict_noise(calibration: Calibration, fit: Fit) -> _PredictedNoise:
                     dof = min(dof, total_dof)
         sigma[group.entries] = math.sqrt(variance)
         inverse_dof += float(np.mean(group.entries)) ** 2 / dof if dof > 0.0 else math.inf
-    return _PredictedNoise(sigma, 1.0 / inverse_dof if inverse_dof else math.inf)
+    dof = 1.0 / inverse_dof if inverse_dof else math.inf
+    return _PredictedNoise(sigma, min(dof, calibration.noise.residual_dof) if by_residuals else dof)
 
 
 def _of_calibration(calibration: Calibration, gauge: GaugeRecord) -> tuple[float, float]:
@@ -226,11 +232,12 @@ def _find_worst_setup(residual: Array, along: Array, observations: Observations)
     information = along.T @ along + np.eye(along.shape[1])
     probabilities: dict[int, float] = {}
     for setup in np.unique(observations.setup).tolist():
-        entries = np.flatnonzero(observations.setup == setup)
+        entries = observations.setup == setup
         rows, r = along[entries], residual[entries]
+        dof = int(entries.sum()) - observations.free_zeros_of(entries)
         fitted = np.linalg.solve(information - rows.T @ rows, rows.T @ r)
         decrease = float(r @ r + (rows.T @ r) @ fitted)
-        probabilities[setup] = chi_square_tail(len(entries), decrease)
+        probabilities[setup] = chi_square_tail(dof, decrease) if dof else 1.0
     return min(probabilities, key=lambda setup: probabilities[setup])
 
 
@@ -304,9 +311,7 @@ def _expect_with_priors(calibration: Calibration, fit: Fit, noise: Array) -> Exp
     def rows(entries: Array) -> Array:
         return o.rows((entries.T * noise).T)
 
-    # a mean over n entries with one zero has 1/n of the variance of an entry
-    share = np.where(o.zero_known, 0.0, 1.0 / np.bincount(o.zero, minlength=o.n_zeros))[o.zero]
-    single = o.minus < 0
+    share, single = zero_shares(o)[o.zero], o.minus < 0
     variances = noise[o.plus] ** 2 * np.where(single, 1.0 - share[o.plus], 1.0)
     variances += np.where(single, 0.0, noise[o.minus] ** 2)
     of_mounting = rows(mounting)

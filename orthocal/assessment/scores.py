@@ -20,7 +20,8 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.statistics.information import assume_others_known, decompose
-from orthocal.statistics.zeros import project_out_zeros
+from orthocal.statistics.noise import Noise
+from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
 Method = Literal["linearised", "exact"]
 
@@ -37,13 +38,16 @@ class Score:
     rms: float
     """RMS of the residuals, [m]."""
     chi_square: float
-    """Σ r²/σ² with the noise of the session; NaN if it is unknown."""
+    """Σ r²/σ² with the known noise of each gauge; NaN if one is unknown."""
     dof: float
     """Independent readings, including repeated ones, minus effective parameters."""
     aicc: float
-    """n ln(Σ r²/n) + 2 k + 2 k (k + 1)/(n − k − 1); infinite if n − k − 1 is not positive."""
+    """m + 2 k + 2 k (k + 1)/(n − k − 1); infinite if n − k − 1 is not positive.
+
+    m = n ln(Σ (r/w)²/n) + Σ ln w² over independent readings, with the estimated noise w of their
+    gauge relative to that of the first gauge."""
     bic: float
-    """n ln(Σ r²/n) + k ln n; infinite without degrees of freedom."""
+    """m + k ln n; infinite without degrees of freedom."""
     prediction_error: Array
     """Cross-validation errors of the rows of each setup, predicted from all other setups, shape
     (n_rows,), [m]; NaN if these do not determine the model."""
@@ -93,7 +97,7 @@ class Undetermined:
 def score_model(
     problem: CalibrationProblem,
     *,
-    noise: float,
+    noises: Mapping[str, Noise],
     by_choice: bool = True,
     options: SolverOptions | None = None,
 ) -> ModelResult:
@@ -101,7 +105,7 @@ def score_model(
 
     Args:
         problem: Problem with the parameters of the model free.
-        noise: Standard deviation of a reading for χ², [m]; NaN if unknown.
+        noises: Known noise of each gauge for χ².
         by_choice: See `ModelResult.by_choice`.
         options: Solver and its options.
 
@@ -124,8 +128,8 @@ def score_model(
         effective=effective,
         prior=bool(problem.machine_selection.prior.any()),
         by_choice=by_choice,
-        linearised=_score(fit, linearisation, "linearised", noise, effective),
-        exact=_score(fit, linearisation, "exact", noise, effective),
+        linearised=_score(fit, linearisation, "linearised", noises, effective),
+        exact=_score(fit, linearisation, "exact", noises, effective),
         calibration=calibration,
         tool=tool,
         linearisation_cost=None if tool is None else _linearisation_cost(fit, tool),
@@ -143,12 +147,16 @@ def _assess_tool(calibration: Calibration) -> ToolAccuracy | None:
 def _effective_parameters(fit: Fit) -> float:
     """Effective number of parameters of a fit."""
     return fit.information.posterior(
-        sigma=fit.sigma, precision=fit.problem.prior_precision
+        sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
     ).effective_parameters
 
 
 def _score(
-    fit: Fit, linearisation: LinearProblem, method: Method, noise: float, effective: float
+    fit: Fit,
+    linearisation: LinearProblem,
+    method: Method,
+    noises: Mapping[str, Noise],
+    effective: float,
 ) -> Score:
     """Score of one method.
 
@@ -156,7 +164,7 @@ def _score(
         fit: Fit of the model.
         linearisation: Linearisation of its problem.
         method: The method.
-        noise: Standard deviation of a reading, [m].
+        noises: Known noise of each gauge.
         effective: Effective number of parameters.
     """
     problem, observations = fit.problem, fit.problem.observations
@@ -167,18 +175,23 @@ def _score(
         residual = np.full(observations.size, np.nan)
     count = observations.size - observations.n_free_zeros
     sum_of_squares = float(residual @ residual)
-    rows = observations.rows(residual)
+    errors = residual * problem.noise_ratio
+    rows = observations.rows(errors)
     k = effective + 1.0  # with the noise
     denominator = count - k - 1.0
     # without any scatter all models fit equally well
     mean_square = max(sum_of_squares / count, SMALLEST_SIGMA**2)
-    misfit = math.nan if math.isnan(sum_of_squares) else count * math.log(mean_square)
+    misfit = math.nan
+    if not math.isnan(sum_of_squares):
+        independent = 1.0 - zero_shares(observations)[observations.zero]
+        misfit = count * math.log(mean_square)
+        misfit += 2.0 * float(independent @ np.log(problem.noise_ratio))
     return Score(
         method=method,
         estimates=dict(zip(problem.machine_selection.names, theta.tolist(), strict=False)),
         residuals=rows,
         rms=float(np.sqrt(np.mean(rows**2))),
-        chi_square=sum_of_squares / noise**2,
+        chi_square=_chi_square(fit, errors, noises),
         dof=count - effective,
         aicc=misfit + 2.0 * k + 2.0 * k * (k + 1.0) / denominator
         if denominator > 0.0
@@ -186,6 +199,16 @@ def _score(
         bic=misfit + k * math.log(count) if count - effective >= 0.5 else math.inf,
         prediction_error=_cross_validate(fit, linearisation, method),
     )
+
+
+def _chi_square(fit: Fit, errors: Array, noises: Mapping[str, Noise]) -> float:
+    """Σ r²/σ² over the entries, with residuals of shape (n_entries,), [m]; NaN if σ is unknown."""
+    total = 0.0
+    for group in fit.groups:
+        sigma = noises[group.name].sigma
+        own = errors[group.entries]
+        total += float(own @ own) / sigma**2 if sigma > 0.0 else math.nan
+    return total
 
 
 def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
@@ -214,7 +237,7 @@ def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> A
         except (NotIdentifiableError, ClosureError, SolverError):
             continue  # errors remain NaN
         rows = entries_left_out[observations.plus]
-        errors[rows] = observations.rows(residual)[rows]
+        errors[rows] = observations.rows(residual * problem.noise_ratio)[rows]
     return errors
 
 

@@ -17,7 +17,11 @@ from typing import Any
 import numpy as np
 
 from orthocal.assessment.assess import assess, assessment_of, is_significant
-from orthocal.assessment.controller_entries import expanded_uncertainty, find_entries
+from orthocal.assessment.controller_entries import (
+    entered_offsets,
+    expanded_uncertainty,
+    find_entries,
+)
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
 from orthocal.assessment.predictive import (
     DeviationTest,
@@ -400,9 +404,8 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     drives = [d.name for d in session.robot.drives]
     entries = {drives.index(e.drive): e for e in find_entries(calibration)}
     if session.controller_offsets is None:
-        offsets = np.zeros(len(drives))
-        offsets[list(entries)] = [e.enter for e in entries.values()]
-        return session.with_controller(offsets) if entries else session
+        stated = entries or calibration.session.controller_offsets is not None
+        return session.with_controller(entered_offsets(calibration)) if stated else session
     differences, where = [], ""
     for i, entry in entries.items():
         active = float(session.active_offsets[i])

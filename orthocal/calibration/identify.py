@@ -28,6 +28,7 @@ from orthocal.observation.observations import require_conditions
 from orthocal.session.completeness import require_complete
 from orthocal.session.session import Session
 from orthocal.statistics.identifiability import find_base_parameters
+from orthocal.statistics.information import marginalise
 
 MAX_BASE_ROUNDS = 8
 
@@ -128,10 +129,11 @@ def _fit_base(
     base parameters do not change.
     """
     information = linearise_problem(with_initial_noise(problem)).information
-    sigma = first_sigma(problem, split_by_gauge(problem.session, problem.observations))
+    groups = split_by_gauge(problem.session, problem.observations)
+    sigma = first_sigma(problem, groups)
     base_names: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
-        factor = information.factor[:, : problem.n_machine]
+        factor = marginalise(information, problem.n_machine, sigma=sigma).factor
         machine = problem.machine_selection.parameters
         combinations = find_base_parameters(factor, machine, threshold=sigma)
         if not combinations:
@@ -146,6 +148,9 @@ def _fit_base(
         reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(base_names))
         fit = fit_problem(reduced, options=options, start=start)
         sigma = max(fit.sigma, sigma)  # no more parameters than before
+        if len(groups) > 1:
+            weighted = problem.with_noise_ratio(fit.problem.noise_ratio)
+            information = linearise_problem(weighted).information
     return fit
 
 

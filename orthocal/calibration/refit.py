@@ -71,7 +71,7 @@ def restore_mounting_covariance(calibration: Calibration) -> Array:
         return np.zeros((problem.n_machine, problem.n_machine))
     return find_mounting_covariance(
         problem,
-        _recorded_information(calibration, problem),
+        _recorded_information(calibration, problem)[1],
         sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
         at_bound=_at_bound(calibration),
     )
@@ -89,10 +89,18 @@ def restore_covariances(calibration: Calibration) -> tuple[Array, Array, Array]:
     if not math.isfinite(calibration.noise.sigma):
         unknown = np.full_like(scale, np.nan)
         return unknown, unknown, unknown
-    posterior = _recorded_information(calibration, problem).posterior(
-        sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
+    sigma = max(calibration.noise.sigma, SMALLEST_SIGMA)
+    prediction, information = _recorded_information(calibration, problem)
+    loss, o = Loss(calibration.solver.loss, calibration.solver.loss_width), problem.observations
+    deviation = (problem.values - prediction) / sigma
+    zeros = loss.centres(deviation, o.zero, o.n_zeros, weights=np.ones(o.size))
+    zeros[o.zero_known] = 0.0
+    used = o.size - calibration.noise.residual_dof
+    posterior = information.posterior(
+        sigma=sigma,
         precision=problem.prior_precision,
         at_bound=_at_bound(calibration),
+        loss=(loss.gain(deviation - zeros[o.zero], used=used), loss.normal_square),
     )
     return (
         scale * posterior.covariance,
@@ -112,11 +120,13 @@ def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
     return problem.with_noise_ratio(ratios[problem.observations.setup])
 
 
-def _recorded_information(calibration: Calibration, problem: CalibrationProblem) -> Information:
-    """Information of the readings about the parameters, at the estimate."""
+def _recorded_information(
+    calibration: Calibration, problem: CalibrationProblem
+) -> tuple[Array, Information]:
+    """Predictions, shape (n_entries,), [m of the first gauge], and information at the estimate."""
     theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
-    _, jacobian = problem.predict_and_jacobian(theta)
-    return decompose(jacobian, problem.observations)
+    prediction, jacobian = problem.predict_and_jacobian(theta)
+    return prediction, decompose(jacobian, problem.observations)
 
 
 def _at_bound(calibration: Calibration) -> Mask:

@@ -123,7 +123,7 @@ class CalibrationProblem:
         """
         other = copy.copy(self)
         other.noise_ratio = noise_ratio
-        for cached in ("values", "linearisation_at_active"):
+        for cached in ("values", "linearisation_at_active", "mirrored"):
             other.__dict__.pop(cached, None)
         return other
 

@@ -238,8 +238,7 @@ class Scatter:
         o, chosen = self.observations, np.logical_or.reduce([g.entries for g in groups])
         cycles = [(*g.repeatability, float(unit[g.entries][0])) for g in groups]
         unit = unit[chosen]
-        n_free_zeros = int((~o.zero_known[np.unique(o.zero[chosen])]).sum())
-        dof = float(chosen.sum() - n_free_zeros - self.used[chosen].sum())
+        dof = float(chosen.sum() - o.free_zeros_of(chosen) - self.used[chosen].sum())
         start = float(np.sqrt(np.mean((self.sigma[chosen] / unit) ** 2)))
         square = self.loss.robust_square(self.residual[chosen] / unit, dof=dof, start=start)
         cycles_dof = sum(n for _, n, _ in cycles)

@@ -29,7 +29,7 @@ from orthocal.hypotheses.hypothesis import (
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
 from orthocal.session.session import Session, split_label
-from orthocal.statistics.zeros import project_out_zeros
+from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
 MAX_JACOBIAN = 2_000_000
 """Largest size of the Jacobian of a single session in which drives may lose steps."""
@@ -98,9 +98,7 @@ class LinearModel:
         for drive, backlash in zip(session.robot.drives, self.compensated.max(axis=0), strict=True):
             if (name := f"{drive.name}.backlash") in free:
                 self.reference[self.problem.free.index(name)] = backlash
-        counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
-        self._shares = np.divide(1.0, counts, out=np.zeros_like(counts), where=~o.zero_known)
-        """Share of one entry in each free gauge zero, 0 for known zeros, shape (n_zeros,)."""
+        self._shares = zero_shares(o)
         self._incidence = self.problem.zero_incidence
 
     def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:

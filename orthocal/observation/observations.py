@@ -108,6 +108,10 @@ class Observations:
         """Number of entries."""
         return self.setup.size
 
+    def free_zeros_of(self, chosen: Mask) -> int:
+        """Number of estimated zeros of masked entries."""
+        return int((~self.zero_known[np.unique(self.zero[chosen])]).sum())
+
     def only(self, chosen: Mask) -> Observations:
         """Masked entries, without the rows of the session."""
         no_rows = np.empty(0, dtype=np.int64)

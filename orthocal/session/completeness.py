@@ -13,6 +13,7 @@ from orthocal.effects.adjustment import require_adjustment
 from orthocal.errors import SessionError
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.sensors.protocol import GaugeZero
+from orthocal.session.differences import IndependentReadings
 from orthocal.session.session import Gauge, Posture, Reading, ReadingKey, Session, Setup
 from orthocal.text import list_some
 
@@ -104,14 +105,14 @@ def _require_setup(session: Session, setup: Setup) -> None:
 
 
 def _require_readings(session: Session) -> None:
-    """Refuse readings without a value, of unknown names, or of the same place and cycle.
+    """Refuse readings without a value, of unknown names, or that follow from others of their cycle.
 
     Raises:
         SessionError: If there are such readings, or none.
     """
     if not session.readings:
         raise SessionError("there are none; expected at least one", where="readings")
-    keys = set[ReadingKey]()
+    keys, independent = set[ReadingKey](), IndependentReadings()
     for r in session.readings:
         _require_kind(r, Reading, "readings")
         if r.setup not in session.setups:
@@ -136,6 +137,8 @@ def _require_readings(session: Session) -> None:
                 where=session.where(r),
             )
         keys.add(r.key)
+        if r.minus is None or session.is_difference(r):
+            independent.add(r, session.where(r))
     missing = sum(not r.is_read for r in session.readings)
     if missing:
         count = len(session.readings)

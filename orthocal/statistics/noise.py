@@ -134,15 +134,6 @@ class Noise:
         return chance_of_excess(chi_square, self.residual_dof)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownNoise:
-    """Noise of a reading that is independent of the model."""
-
-    sigma: float
-    """Standard deviation of a reading, [m]; NaN if unknown."""
-    source: Literal["cycles", "gauge", "unknown"]
-
-
 def estimate_repeatability(values: Array, observations: Observations) -> tuple[float, int]:
     """Standard deviation of repeated readings of the same setup in the same posture.
 

@@ -34,6 +34,16 @@ def project_out_zeros(
     return np.asarray((flat - means[observations.zero]).reshape(values.shape))
 
 
+def zero_shares(observations: Observations) -> Array:
+    """Share of one entry in each free gauge zero, 0 for known zeros, shape (n_zeros,).
+
+    Residuals of independent entries of variance σ² have the variance (1 − share) σ².
+    """
+    counts = np.bincount(observations.zero, minlength=observations.n_zeros).astype(np.float64)
+    free = (counts > 0.0) & ~observations.zero_known
+    return np.divide(1.0, counts, out=np.zeros_like(counts), where=free)
+
+
 def eliminate_zero(weights: Array) -> tuple[Array, Array, float]:
     """Inverse covariance W of readings with one free zero, P = W − W 1 1ᵀ W / (1ᵀ W 1).
 

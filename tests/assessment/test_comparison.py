@@ -9,15 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibrated import SOUND, calibrated, session_of
+from gauges import with_gauges, with_scatter
 
 from orthocal import calibrate, summarize
-from orthocal.assessment.comparison import compare_models
+from orthocal.assessment.comparison import compare_models, find_known_noises
 from orthocal.assessment.recommendation import (
     STRONG,
     ModelEvidence,
     Recommendation,
     recommend_model,
 )
+from orthocal.assessment.scores import score_model
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.comparison import describe_recommendation
 from orthocal.errors import ParameterError
@@ -27,6 +29,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.output.text.comparison import MORE
 from orthocal.output.text.summary import result_json
+from orthocal.session.session import Gauge
 from orthocal.statistics.zeros import project_out_zeros
 
 QUICK = SolverOptions("variable-projection")
@@ -138,11 +141,16 @@ def test_the_tool_error_is_that_of_calibrate(cycles):
 
 
 def test_the_scores_of_table_1_solved_by_hand(table1):
-    """χ² of six differences with σ√2 each, three parameters; AICc and BIC by their formulas."""
+    """χ² of six differences with σ√2 each, three parameters; AICc and BIC by their formulas.
+
+    The dial has a stated σ of 20 µm and a step of 10 µm.
+    """
     score = table1["offsets"].exact
     square = float(np.sum(score.residuals**2))
     assert score.rms == pytest.approx(np.sqrt(square / 6))
-    assert score.chi_square == pytest.approx(square / (2 * 0.02e-3**2), rel=1e-9)
+    assert score.chi_square == pytest.approx(
+        square / (2 * (0.02e-3**2 + 0.01e-3**2 / 12)), rel=1e-9
+    )
     assert 2.998 < score.dof < 3.0  # nuisance parameters reduce it a little
     k = 7.0 - score.dof
     # six independent differences are six readings of variance one without their zeros
@@ -158,6 +166,98 @@ def test_a_known_zero_takes_no_degree_of_freedom():
     compared = compare_models(session, models=["offsets"])
     (result,) = compared.results
     assert result.exact.dof == pytest.approx(len(session.readings) - 1 - result.effective)
+
+
+COARSE, FINE = Gauge(20e-6), Gauge(2e-6)
+
+
+def scores_of(session, models):
+    """Results by model; the readings are not judged."""
+    noises = find_known_noises(session)
+    return {
+        m: score_model(build_problem(session, model=m), noises=noises, options=QUICK)
+        for m in models
+    }
+
+
+def read_with_two_gauges(fine_setups, *, scale, seed):
+    """A drawn machine, read with a coarse gauge and a fine one."""
+    session = session_of("raw-cycles")
+    session = with_gauges(session, {"coarse": COARSE, "fine": FINE}, fine_setups)
+    problem = build_problem(session, model="full", prior=True)
+    rng = np.random.default_rng(seed)
+    drawn = rng.normal(size=problem.n_free) * problem.theta_scale * scale
+    return with_scatter(session, drawn, problem, rng)
+
+
+def test_scores_of_several_gauges_are_in_metres():
+    """Residuals, RMS and predictions are those of `calibrate`; χ² has the noise of each gauge."""
+    session = read_with_two_gauges(("xz", "yz", "zy"), scale=0.01, seed=1)
+    result = scores_of(session, ["offsets"])["offsets"]
+    score, rows = result.exact, result.calibration.residuals
+    assert score.residuals == pytest.approx([r.residual for r in rows], rel=1e-6, abs=1e-12)
+    assert score.rms == pytest.approx(result.calibration.rms_after, rel=1e-6)
+    predicted = np.sqrt(np.mean([r.prediction_error**2 for r in rows]))
+    assert score.prediction_rms == pytest.approx(predicted, rel=0.02)  # to first order there
+    known = {
+        g.name: g.noise.without_residuals(g.sigma, g.resolution)[0]
+        for g in result.calibration.gauges
+    }
+    assert known["coarse"] > 5.0 * known["fine"]
+    square = sum((r.residual / known[session.setups[r.setup].gauge]) ** 2 for r in rows)
+    assert score.chi_square == pytest.approx(square, rel=1e-6)
+    assert 0.5 < score.chi_square / score.dof < 2.0
+
+
+def test_criteria_do_not_depend_on_the_order_of_the_gauges():
+    """The noise ratios of the models differ, but all compare readings in metres."""
+    session = read_with_two_gauges(("xz", "yz"), scale=1.0, seed=7)
+    swapped = replace(session, gauges=dict(reversed(session.gauges.items())))
+    models = ["offsets", "lengths", "full"]
+    first, second = scores_of(session, models), scores_of(swapped, models)
+    for m in models:
+        scores = first[m].exact, second[m].exact
+        for criterion in ("rms", "chi_square", "aicc", "bic", "prediction_rms"):
+            numbers = [getattr(s, criterion) for s in scores]
+            assert numbers[0] == pytest.approx(numbers[1], rel=1e-5, abs=1e-9), criterion
+
+
+def test_criteria_of_several_gauges_solved_by_hand():
+    """-2 ln L of independent contrasts of variance σ²: n ln σ² and 2 ln of each gauge's ratio."""
+    session = read_with_two_gauges(("xz", "yz"), scale=1.0, seed=7)
+    result = scores_of(session, ["offsets"])["offsets"]
+    o = build_problem(session, free=["*.offset"]).observations
+    sigmas = {g.name: g.noise.sigma for g in result.calibration.gauges}
+    gauge_of = {n: s.gauge for n, s in session.setups.items()}
+    counts = {
+        name: sum(gauge_of[r.setup] == name for r in session.readings)
+        - sum(gauge_of[s] == name for s in o.zero_setup)
+        for name in sigmas
+    }
+    square = sum(
+        (r.residual / sigmas[gauge_of[r.setup]]) ** 2 for r in result.calibration.residuals
+    )
+    n = sum(counts.values())
+    misfit = n * math.log(square / n)
+    misfit += 2.0 * sum(counts[name] * math.log(sigmas[name]) for name in sigmas)
+    k = result.effective + 1.0
+    assert result.exact.bic == pytest.approx(misfit + k * math.log(n), rel=1e-7)
+
+
+def test_a_parameter_at_a_bound_is_no_effective_one(raw_cycles):
+    problem = build_problem(raw_cycles, model="offsets", bounds={"x_slide.offset": (0.0, 0.05e-3)})
+    result = score_model(problem, noises=find_known_noises(raw_cycles), options=QUICK)
+    assert result.calibration.free[0].at_bound == "upper"
+    assert result.effective == pytest.approx(2.0, abs=0.01)
+    assert result.exact.dof == pytest.approx(result.calibration.noise.residual_dof)
+
+
+def test_known_noise_includes_the_rounding_of_the_gauge():
+    """Readings that are rounded to 10 µm scatter by 2.9 µm in addition to the stated 5 µm."""
+    session = replace(session_of("sweep"), gauges={"": Gauge(5e-6, 10e-6)})
+    (noise,) = find_known_noises(session).values()
+    assert noise.source == "gauge"
+    assert noise.sigma == pytest.approx(math.hypot(5e-6, 10e-6 / math.sqrt(12.0)))
 
 
 def extend_to(problem, fit):
@@ -208,7 +308,8 @@ def test_repeated_readings_are_not_counted_as_new_ones(cycles):
     """Six setups in three postures, three times over: twelve differences, whatever the cycles."""
     assert cycles.independent == 12
     assert cycles["full"].redundancy == 0
-    assert cycles.noise.source == "cycles"
+    # the cycles scatter by 10.2 µm, less than the 10.4 µm that the gauge states with its rounding
+    assert {n.source for n in cycles.noises.values()} == {"gauge"}
     assert cycles.recommendation.model == "offsets"
     assert cycles.assessment.of_kind("fits")
     assert cycles.assessment.decision.verdict == "enter"
@@ -228,7 +329,9 @@ def test_an_unstated_noise_is_unknown(experiment_2):
     found = compare_models(session, models=["offsets"], options=QUICK)
     assert found.assessment.of_kind("noise from residuals")
     assert found.assessment.decision.exit_code == 0
-    assert json.loads(found.to_json())["noise"] is None
+    assert json.loads(found.to_json())["noises"] == [
+        {"gauge": "", "sigma": None, "source": "unknown"}
+    ]
 
 
 def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):

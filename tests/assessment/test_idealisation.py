@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED
+from calibrated import UNJUDGED, identified
+from gauges import with_gauges
 from machines import place, reading_by_pinocchio
 
 from orthocal import calibrate, load_plan, simulate_session
-from orthocal.assessment.fit_findings import find_idealised
+from orthocal.assessment.fit_findings import _idealisation, find_idealised
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.session.session import Gauge
 from orthocal.units import MM
 
 QUICK = {"solver": "variable-projection"}
@@ -37,9 +39,21 @@ def test_the_deviation_of_a_rod_from_its_line_is_that_by_pinocchio(raw_cycles):
         step = 0.1 * robot.parameters[name].prior_std
         plus, minus = (difference(robot.with_errors({name: s * step})) for s in (1.0, -1.0))
         total += ((plus - minus) / 0.2) ** 2
-    found = find_idealised(raw_cycles)
+    found = find_idealised(raw_cycles, {"": 1e-5})
     assert (found.setup[0], found.touches) in {(leg, "a") for leg in "xyz"}  # they tie
     assert found.size == pytest.approx(np.sqrt(total), rel=1e-4)
+
+
+def test_an_assumed_line_matters_for_the_gauge_that_reads_it(raw_cycles):
+    """The coarse first gauge reads five setups, the fine one the sixth."""
+    gauges = {"coarse": Gauge(0.2 * MM), "fine": Gauge(5e-6)}
+    for names in (["coarse", "fine"], ["fine", "coarse"]):
+        session = with_gauges(raw_cycles, {n: gauges[n] for n in names}, ["zy"])
+        found = identified(session, "full")
+        (assumed,) = _idealisation(found)
+        sigma = next(g.noise.sigma for g in found.gauges if g.name == "fine")
+        assert assumed.numbers["sigma_mm"] == pytest.approx(sigma / MM)
+        assert "zy" in assumed.text
 
 
 def test_an_assumed_line_is_named_where_it_matters(root, raw_cycles):
@@ -51,5 +65,5 @@ def test_an_assumed_line_is_named_where_it_matters(root, raw_cycles):
     assert not calibrate(coarse, **UNJUDGED).assessment.of_kind("line assumed")
     plan = load_plan(root / "examples/workshop/plan.yaml")
     on_rods = simulate_session(plan, {}, seed=0).session
-    assert find_idealised(on_rods) is None
+    assert find_idealised(on_rods, {}) is None
     assert not calibrate(on_rods, "offsets", **UNJUDGED).assessment.of_kind("line assumed")

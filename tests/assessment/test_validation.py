@@ -13,7 +13,7 @@ from calibrated import UNJUDGED, calibrated, identified, plan_of, session_of
 from effect_plans import FEW, effect_plan
 from models import TRUTH
 from planned import quick_plan
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 from scipy.stats import t as student
 from tolerances import THREE_DECIMALS_MM
 
@@ -38,11 +38,13 @@ from orthocal.assessment.controller_entries import (
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.predictive import (
     Repetition,
+    _find_worst_setup,
+    _predict_noise,
     expect_deviations,
     judge_deviations,
     measure_repetition,
 )
-from orthocal.assessment.validation import ENTRY_KINDS
+from orthocal.assessment.validation import ENTRY_KINDS, _with_active_offsets
 from orthocal.assessment.wording import join_texts
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -52,6 +54,7 @@ from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.observation.observations import build_observations
 from orthocal.output.text.summary import result_json
 from orthocal.statistics.chance import BY_CHANCE
 
@@ -227,6 +230,17 @@ def test_only_identified_offsets_must_be_active(experiment_3):
         validate_calibration(calibration, experiment_3.with_controller(entered))
 
 
+def test_a_session_without_stated_offsets_has_the_offsets_after_the_entries(raw_cycles):
+    """A drive whose offset the calibration does not identify keeps the one while measuring."""
+    active = [0.2e-3, -0.1e-3, 1e-3]
+    choice = Choice(free=["x_slide.offset", "y_slide.offset"])
+    calibration = calibrate(raw_cycles.with_controller(active), choice, **UNJUDGED)
+    new = replace(raw_cycles, controller_offsets=None)
+    assumed = _with_active_offsets(calibration, new).active_offsets
+    assert assumed[2] == active[2]
+    assert assumed.tolist() == entered_offsets(calibration).tolist()
+
+
 def test_sessions_of_the_calibration_are_refused(experiment_3):
     session = session_of("table1/experiment-2")
     both = identified([session, experiment_3])
@@ -361,6 +375,36 @@ def test_the_setup_to_read_again_is_the_one_that_disagrees_with_the_others():
             unconfirmed += 1
             named += list(fit.problem.session.setups)[test.worst_setup] == setup
     assert named == unconfirmed >= 3
+
+
+def test_a_free_zero_takes_a_degree_of_freedom_of_its_setup(raw_cycles):
+    """Probabilities of 0.001 and 0.002: two readings of one setup, nine of another."""
+    chosen = [r for r in raw_cycles.readings if r.setup == "yx"]
+    chosen += [r for r in raw_cycles.readings if r.setup == "zx"][:2]
+    o = build_observations(raw_cycles.select(chosen))
+    residual = np.zeros(o.size)
+    for name, count, chance in (("yx", 9, 0.002), ("zx", 2, 0.001)):
+        square = chi2.isf(chance, count - 1)
+        own = np.array(o.zero_setup)[o.zero] == name
+        residual[np.flatnonzero(own)[:2]] = np.array([1.0, -1.0]) * np.sqrt(square / 2.0)
+    worst = _find_worst_setup(residual, np.zeros((o.size, 1)), o)
+    assert list(raw_cycles.setups)[worst] == "zx"
+    known = replace(o, zero_known=np.ones(o.n_zeros, dtype=bool))
+    assert (
+        list(raw_cycles.setups)[_find_worst_setup(residual, np.zeros((o.size, 1)), known)] == "yx"
+    )
+
+
+def test_the_noise_that_several_sessions_share_counts_once(experiment_3):
+    """Eight entries of each of two sessions, with eleven parameters and zeros: five checks."""
+    session = session_of("table1/experiment-2")
+    days = [replace(s.select(s.readings[:4]), title=s.title) for s in (session, experiment_3)]
+    calibration = identified(days, "offsets")
+    shared = [g.noise.residual_dof for g in calibration.gauges]
+    assert shared == [calibration.noise.residual_dof] * 2
+    assert shared[0] == pytest.approx(5.0, abs=0.01)
+    predicted = _predict_noise(calibration, repeat_fit(calibration, experiment_3))
+    assert predicted.dof == pytest.approx(shared[0])
 
 
 def test_number_and_limit_are_printed_differently():

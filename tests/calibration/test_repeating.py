@@ -20,6 +20,7 @@ from orthocal import (
 )
 from orthocal.calibration.file import calibration_document
 from orthocal.calibration.identify import identify
+from orthocal.calibration.refit import restore_covariances
 from orthocal.errors import CalibrationFileError
 
 CASES = [
@@ -46,6 +47,15 @@ def test_a_calibration_is_repeated_from_its_file(tmp_path, names, model, loss, s
     for p, q in zip(made.setups, again.setups, strict=True):
         assert (p.zero is None) == (q.zero is None)
         assert p.zero is None or q.zero == pytest.approx(p.zero, abs=1e-9)
+
+
+@pytest.mark.parametrize("loss", ["huber", "squares"])
+def test_the_covariance_of_a_calibration_follows_from_its_record(loss):
+    made, _ = identify(session_of("workshop"), "full", loss=loss, solver="variable-projection")
+    covariance, of_noise, _ = restore_covariances(made)
+    n = len(made.free)
+    assert covariance[:n, :n] == pytest.approx(made.model_covariance, rel=1e-6, abs=1e-18)
+    assert of_noise[:n, :n] == pytest.approx(made.noise_covariance, rel=1e-6, abs=1e-18)
 
 
 @pytest.fixture(scope="module")

@@ -139,6 +139,14 @@ def test_heights_that_noise_hides_are_not_compared():
     assert one.iterations == other.iterations
 
 
+def test_mirrored_directions_are_in_the_unit_of_the_readings():
+    """Readings of half the unit have twice the curvature, also of a problem in other units."""
+    problem = problem_of(circles(entered("biglide"), {"a": bar_at(0.0)}))
+    curvature = problem.mirrored.curvatures
+    halved = problem.with_noise_ratio(np.full(problem.observations.size, 0.5))
+    assert halved.mirrored.curvatures == pytest.approx(2.0 * curvature)
+
+
 def test_a_prescribed_height_keeps_its_value():
     problem = problem_of(circles(entered("biglide"), {"a": bar_at(0.0), "b": bar_at(1e-3)}))
     height = problem.free.index("setup.a.centre_z")

@@ -12,7 +12,7 @@ from machines import frame_pose
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import SolverOptions, draw_errors, load_plan, load_session, write_session
+from orthocal import Choice, SolverOptions, draw_errors, load_plan, load_session, write_session
 from orthocal.calibration.identify import identify
 from orthocal.errors import SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -200,6 +200,22 @@ def test_noise_of_two_gauges_is_found_on_a_machine_far_from_its_nominal_one(tmp_
     found = identified(session)
     assert found.noise.source == "gauge"
     assert found.noise.sigma == pytest.approx(np.hypot(5e-6, 1e-5 / np.sqrt(12.0)))
+
+
+@pytest.mark.parametrize(("legs", "seed", "count"), [(False, 1, 8), (False, 2, 8), (True, 3, 11)])
+def test_base_parameters_beside_an_unknown_ball_are_the_recorded_ones(tmp_path, legs, seed, count):
+    """A ball and a length that are unknown leave eight sums of errors, not twelve.
+
+    The residuals show the noise of both gauges of the third session.
+    """
+    plan = circles(tmp_path, legs=legs)
+    errors = draw_errors(plan.robot, ["*"], seed=seed, tolerances={"*.offset_mm": 1.0})
+    session = simulate_session(plan, errors, seed=seed).session
+    found = identified(session, Choice("full", base=True))
+    recorded = {combination.terms[0][0] for combination in found.identifiability.base}
+    assert {p.name for p in found.free} == recorded
+    assert len(recorded) == count
+    assert all(p.std < p.prior_std for p in found.free)
 
 
 @pytest.mark.parametrize("height", [0.0, 0.02])

@@ -85,6 +85,24 @@ def test_a_session_that_cannot_be_calibrated_is_refused(session, change, place, 
     assert place in str(caught.value)
 
 
+def test_differences_that_follow_from_others_of_their_cycle_are_refused():
+    """Both directions of one difference, and three differences in a circle."""
+    session = session_of("table1/experiment-2")
+    first = session.readings[0]
+    reverse = replace(first, posture=first.minus, minus=first.posture)
+    for cycle, accepted in ((first.cycle, False), (first.cycle + 1, True)):
+        changed = replace(session, readings=(*session.readings, replace(reverse, cycle=cycle)))
+        if accepted:
+            require_complete(changed)
+            continue
+        with pytest.raises(SessionError, match="follows from the other differences of setup"):
+            calibrate(changed)
+    other = next(n for n in session.postures if n not in (first.posture, first.minus))
+    circle = [replace(first, minus=other), replace(first, posture=other)]
+    with pytest.raises(SessionError, match="follows from the other differences of setup"):
+        require_complete(replace(session, readings=(*session.readings, *circle)))
+
+
 def test_every_use_checks_the_session(session):
     for use in (calibrate, check_session):
         with pytest.raises(SessionError, match="'xx' is not a setup"):

@@ -23,6 +23,7 @@ from orthocal.sensors.protocol import (
     largest_reading,
     reads_pairs,
 )
+from orthocal.session.differences import IndependentReadings
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten, spans
 from orthocal.units import MM
@@ -188,8 +189,7 @@ class _AcceptedReadings:
         self._needs_approach = needs_approach
         self._first_lines: dict[ReadingKey, int] = {}
         self._first_line_by_zoned: dict[bool, int] = {}
-        self._absolute: set[tuple[str, int]] = set()
-        self._differences: dict[tuple[str, int], dict[str, str]] = {}
+        self._independent = IndependentReadings()
 
     def add(self, row: RawReading, reading: Reading, *, of_pair: bool) -> None:
         """Add a reading that agrees with the previous ones.
@@ -209,7 +209,7 @@ class _AcceptedReadings:
         if len(self.readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
         if not of_pair:
-            self._require_independent(reading, row.where)
+            self._independent.add(reading, row.where)
         self.readings.append(reading)
         self.places.append(row.where)
 
@@ -240,40 +240,6 @@ class _AcceptedReadings:
                 f"without one, as in line {self._first_line_by_zoned[not zoned]}",
                 where=row.where,
             )
-
-    def _require_independent(self, reading: Reading, where: str) -> None:
-        """Refuse linearly dependent differences, and a mix of readings and differences.
-
-        Both refer to one cycle of one setup.
-        """
-        group = (reading.setup, reading.cycle)
-        if reading.minus is None:
-            self._absolute.add(group)
-        else:
-            leaders = self._differences.setdefault(group, {})
-            first, second = (_find_leader(leaders, n) for n in (reading.posture, reading.minus))
-            if first == second:
-                raise SessionError(
-                    f"{reading.label} follows from the other differences of setup "
-                    f"{reading.setup} in cycle {reading.cycle}; delete it, or use another cycle "
-                    "if it was measured separately",
-                    where=where,
-                )
-            leaders[first] = second
-        if group in self._absolute and group in self._differences:
-            raise SessionError(
-                f"setup {reading.setup} has both readings and differences in cycle "
-                f"{reading.cycle}; keep the readings only",
-                where=where,
-            )
-
-
-def _find_leader(leaders: dict[str, str], name: str) -> str:
-    """Union-find root of a posture among postures that differences connect (path halving)."""
-    while (parent := leaders.get(name, name)) != name:
-        leaders[name] = leaders.get(parent, parent)
-        name = parent
-    return name
 
 
 def require_name(name: str, names: Collection[str], noun: str, *, where: str) -> None:

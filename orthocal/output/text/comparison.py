@@ -67,10 +67,12 @@ def render_comparison(
         return Group(*answer, Text(MORE))
     further = [f.words for f in assessed.findings if f.kind in RESEARCH and f not in recommended]
     further += [e for f in assessed.findings if (e := describe_evidence(f))]
-    noise = (
-        f"{counted(c.independent, 'independent reading')}; σ of a reading: "
-        f"{mm(c.noise.sigma)} mm, {NOISE_SOURCES[c.noise.source]}"
-    )
+    sigmas = [
+        f"σ of a reading{f' of the gauge {name!r}' if len(c.noises) > 1 else ''}: "
+        f"{mm(noise.sigma)} mm, {NOISE_SOURCES[noise.source]}"
+        for name, noise in c.noises.items()
+    ]
+    noise = "; ".join([counted(c.independent, "independent reading"), *sigmas])
     return Group(
         *answer,
         section("Further findings", bullets([noise, *further])),
