@@ -15,7 +15,7 @@ from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.sessions import changes_between_sessions
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.families.wrong_readings import wrong_readings
-from orthocal.hypotheses.hypothesis import Family, Rows, to_dense
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, to_dense
 from orthocal.hypotheses.hypothesis_set import HypothesisSet, Term
 from orthocal.hypotheses.likelihood import Products, log_of_sum
 from orthocal.hypotheses.linear_model import LinearModel
@@ -87,7 +87,7 @@ class FamilyScorer:
                 logs = np.array(
                     [
                         likelihood.score_set(
-                            deviation, [self.model.entries(_effects_of_group(g, n_rows))]
+                            deviation, [self.model.entries(self._effects_of_group(g)[0])]
                         ).log_likelihood
                         for g in family.groups
                     ]
@@ -142,7 +142,9 @@ class FamilyScorer:
         added, cross = model.products(effects, about, deviation)
         if edits is not None:
             inner = model.inner(edits, effects)
-        return about.likelihood.score(products, added, cross + inner)
+        unit = model.relative_noise(effects)
+        added = Products(added.along * unit[:, None], added.square * unit**2)
+        return about.likelihood.score(products, added, (cross + inner) * unit)
 
     def _score_shifts(self, state: HypothesisSet, family: Family) -> Array:
         """Log likelihoods of the machine shifts of a family, shape (h,)."""
@@ -162,9 +164,8 @@ class FamilyScorer:
         prior = float(_prior(family)[h])
         explanation = family.explain(h)
         if family.groups:
-            return Term(
-                explanation, prior, effects=_effects_of_group(family.groups[h], self._n_rows)
-            )
+            effects, unit = self._effects_of_group(family.groups[h])
+            return Term(explanation, prior, effects=effects, unit=float(unit[0]))
         if family.systematic:
             effect = family.systematic[h]
             return Term(explanation, prior, -effect.change, effect.columns, effect)
@@ -176,12 +177,21 @@ class FamilyScorer:
                 size = float(np.abs(self.model.shift_entries(self.sound, shift)).max()) or 1.0
                 shift = replace(shift, direction=shift.direction / size, unit=1.0 / size)
             return Term(explanation, prior, shift=shift, known=family.known)
-        return Term(
-            explanation,
-            prior,
-            None if family.edits is None else family.edits.one(h),
-            None if family.effects is None else family.effects.one(h)[None],
-        )
+        edit = None if family.edits is None else family.edits.one(h)
+        if family.effects is None:
+            return Term(explanation, prior, edit)
+        effects, unit = self._relative(family.effects.one(h)[None])
+        return Term(explanation, prior, edit, effects, unit=float(unit[0]))
+
+    def _effects_of_group(self, group: Sequence[Indices] | Array) -> tuple[Array, Array]:
+        """Effects of a group as `_relative` returns them."""
+        marked = group if isinstance(group, np.ndarray) else marks(group, self._n_rows)
+        return self._relative(marked)
+
+    def _relative(self, effects: Array) -> tuple[Array, Array]:
+        """Effects on the rows (k, n_rows) per amount relative to the noise, and its unit (k,)."""
+        unit = self.model.relative_noise(Patterns(effects))
+        return effects * unit[:, None], unit
 
     def shortlist(self, scored: Sequence[tuple[Family, Array]]) -> list[Term]:
         """The most likely single hypotheses, and the most likely one of each kind."""
@@ -237,6 +247,7 @@ class FamilyScorer:
             np.vstack([np.zeros((0, self._n_rows)), *(to_dense(p.to_sparse()) for p in part if p)])
             for part in ([f.edits for f in edits], [f.effects for f in effects])
         ]
+        rows[1], _ = self._relative(rows[1])
         singles = Singles(
             self.model.entries(rows[0]),
             self.model.entries(rows[1]),
@@ -287,8 +298,3 @@ def _prior(family: Family) -> Array:
     """Logarithms of prior probabilities, with the volume factors, shape (h,)."""
     prior = np.full(family.count, -np.log(family.size * N_FAMILIES))
     return prior if family.log_volume is None else prior + family.log_volume
-
-
-def _effects_of_group(group: Sequence[Indices] | Array, count: int) -> Array:
-    """Effects of a group per unit, shape (k, count)."""
-    return group if isinstance(group, np.ndarray) else marks(group, count)

@@ -57,6 +57,16 @@ class Tails:
             result[members] = np.cumsum(products, axis=0)[::-1][self.start[members]]
         return result
 
+    def smallest(self, values: Array) -> Array:
+        """Smallest of the values (n_rows,) of the rows that each pattern changes, shape (h,)."""
+        result = np.empty(self.segment.size)
+        for s in np.unique(self.segment):
+            members = self.segment == s
+            rows, base = self.segments[s]
+            changed = np.where(base != 0.0, values[rows], np.inf)
+            result[members] = np.minimum.accumulate(changed[::-1])[::-1][self.start[members]]
+        return result
+
     def to_sparse(self, count: int) -> Sparse:
         """Patterns as a sparse matrix, shape (h, count)."""
         rows = [self.segments[s][0][k:] for s, k in zip(self.segment, self.start, strict=True)]
@@ -84,6 +94,22 @@ class Patterns:
         """Matrix product of the patterns with a matrix (n_rows, m), shape (h, m)."""
         product = np.asarray(self.rows @ matrix)
         return product if self.tails is None else product + self.tails.product(matrix)
+
+    def smallest(self, values: Array) -> Array:
+        """Smallest of positive values of the rows that each pattern changes, shape (h,).
+
+        Args:
+            values: Values of the rows, shape (n_rows,).
+        """
+        if isinstance(self.rows, np.ndarray):
+            smallest = np.where(self.rows != 0.0, values, np.inf).min(axis=1, initial=np.inf)
+        else:
+            inverse = (self.rows != 0.0).multiply(1.0 / values).max(axis=1)
+            with np.errstate(divide="ignore"):
+                smallest = 1.0 / np.asarray(inverse.toarray(), dtype=np.float64).ravel()
+        if self.tails is not None:
+            smallest = np.minimum(smallest, self.tails.smallest(values))
+        return np.asarray(smallest)
 
     def to_sparse(self) -> Sparse:
         """All patterns as one sparse matrix, shape (h, n_rows)."""

@@ -40,6 +40,8 @@ class Term:
     shift: MachineShift | None = None
     known: bool = True
     """Whether the amount of the shift is known."""
+    unit: float = 1.0
+    """Unit of the amount of a single effect: the noise of its gauge relative to the first one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +56,8 @@ class HypothesisSet:
     corrected: Array
     """Corrected rows, shape (n_rows,), [m]."""
     amounts: tuple[Array, ...]
-    """Unknown amounts of each term, [m]; of machine shifts in units of their direction."""
+    """Unknown amounts of each term, [m] times its unit; of machine shifts in units of their
+    direction."""
     stds: tuple[Array, ...]
     """Standard deviations of the amounts."""
 
@@ -120,7 +123,7 @@ def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
     explanations = []
     for term, amounts, stds in zip(state.terms, state.amounts, state.stds, strict=True):
         e = term.explanation
-        unit = 1.0 if term.shift is None else term.shift.unit
+        unit = term.unit if term.shift is None else term.shift.unit
         single = term.effects is not None and len(term.effects) == 1 and e.kind != "row offset"
         if term.systematic is not None:
             e = _with_parameters(e, term.systematic, amounts, stds)

@@ -41,7 +41,7 @@ WRONG_NOISE_PROBABILITY = 0.05
 """Prior probability that the stated noise is wrong."""
 
 AMOUNT_STDS = np.geomspace(6.0, 6000.0, 4)
-"""Grid of the standard deviation τ of an effect's amount, relative to the noise."""
+"""Grid of the standard deviation τ of an effect's amount, relative to the noise of its gauge."""
 
 MIN_RELATIVE_SINGULAR_VALUE = 1e-9
 """Singular values up to this, relative to the largest, count as 0."""

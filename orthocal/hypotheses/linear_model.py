@@ -577,6 +577,14 @@ class LinearModel:
         cross = patterns.product((self.to_entries @ deviation)[:, None])[:, 0]
         return Products(along, np.maximum(square, 0.0)), cross
 
+    def relative_noise(self, patterns: Patterns) -> Array:
+        """Noise of the rows that patterns change, relative to that of the first gauge, shape (h,).
+
+        It is that of their most precise gauge, and 1 for a pattern without rows.
+        """
+        smallest = patterns.smallest(self.problem.noise_ratio[self.problem.observations.plus])
+        return np.asarray(np.where(np.isfinite(smallest), smallest, 1.0))
+
     def inner(self, patterns: Patterns, others: Patterns) -> Array:
         """Inner products of patterns, pair by pair, zeros projected out, shape (h,), [m²].
 

@@ -208,6 +208,23 @@ def test_the_evidence_of_a_stuck_dial_does_not_depend_on_the_order_of_the_gauges
     assert found == pytest.approx([-np.log(2e-6)] * 2)
 
 
+@pytest.mark.parametrize("kind", ["outlier", "displaced gauge"])
+def test_the_evidence_of_an_amount_does_not_depend_on_the_order_of_the_gauges(cycles, kind):
+    """Amounts are compared with the noise of the gauge of their readings."""
+    noises, found = {"dial": 2e-6, "other": 0.1e-3}, []
+    rows = [i for i, r in enumerate(cycles.readings) if r.setup == "xz"]
+    values = cycles.values
+    values[rows[4] if kind == "outlier" else rows[4:]] += 0.1e-3
+    for first in noises:
+        session = two_gauges(cycles, {first: noises[first], **noises}, ("yx", "zx"))
+        (anomaly,) = find_anomalies(session.with_values(values)).found
+        assert anomaly.explanation.kind == kind
+        if kind == "displaced gauge":
+            assert anomaly.explanation.amount == pytest.approx(0.1e-3, abs=0.02e-3)
+        found.append(anomaly.log_evidence)
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
 def test_a_sigma_in_a_wrong_unit_is_the_only_finding(cycles):
     wrong = cycles.with_gauge(replace(cycles.gauge, sigma=1e-3, resolution=1e-5))
     assert [found.kind for found in anomalies(wrong)] == ["sigma too large"]
@@ -302,6 +319,10 @@ def test_products_by_cumulative_sums_are_those_of_dense_patterns(name):
         for patterns in (family.edits, family.effects):
             if patterns is None or patterns.tails is None:
                 continue
+            values = np.random.default_rng(0).uniform(1.0, 2.0, rows.count)
+            changed = to_dense(patterns.to_sparse()) != 0.0
+            least = np.where(changed, values, np.inf).min(axis=1)
+            assert patterns.smallest(values) == pytest.approx(least)
             found, cross = model.products(patterns, about, deviation)
             dense = model.entries(to_dense(patterns.to_sparse()))
             assert found.along == pytest.approx(dense @ about.likelihood.directions.T, abs=1e-9)
