@@ -428,7 +428,8 @@ def test_readings_without_the_condition_are_refused(tmp_path):
         identify(replace(session, readings=numbered), Choice(free=FREE, effects=["slack"]))
     assert f"column `approach` is missing or empty in {last}. The effect" in str(caught.value)
     assert f"{n} of {n} readings" in str(caught.value)
-    one, other = session.readings[:2]
+    one = session.readings[0]
+    other = next(r for r in session.readings if r.posture != one.posture)
     difference = replace(session, readings=(replace(one, minus=other.posture),))
     with pytest.raises(SessionError, match="belongs to two postures, so that it states no cond"):
         identify(difference, Choice(free=FREE, effects=["slack"]))
