@@ -172,7 +172,7 @@ class Candidates:
     @property
     def unusable(self) -> dict[str, float]:
         """Gauges whose range is too small for any setup, with `needed`, [m]."""
-        usable = {s.gauge for s in self.setups if s.reachable.sum(axis=1).max() >= MIN_READINGS}
+        usable = {s.gauge for s in self.setups if s.reachable.sum(axis=1).max() >= s.min_readings}
         return {gauge: v for gauge, v in self.needed.items() if gauge not in usable}
 
     @property

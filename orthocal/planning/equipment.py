@@ -321,18 +321,23 @@ def equipment_of(session: Session, equipment: Equipment) -> Equipment:
     """Equipment with the gauge, the tip and the rods of a session.
 
     Args:
-        session: The session; of several gauges and sensors, the first is used.
+        session: The session; of several indicators at legs the first is used, one at a rod first.
         equipment: The other equipment.
 
     Raises:
         SessionError: If the repeatability of the readings is unknown.
     """
     session = state_noise(session)
-    sensors = [s.sensor for s in session.setups.values() if isinstance(s.sensor, LegIndicator)]
-    sensors.sort(key=lambda s: s.rod is None)  # sensors that touch rods come first
-    equipment = replace(equipment, gauge=session.gauge, tip=None)
-    if not sensors:
+    at_legs = {
+        name: s.sensor for name, s in session.setups.items() if isinstance(s.sensor, LegIndicator)
+    }
+    if not at_legs:
         return equipment
+    # sensors that touch rods come first
+    names = sorted(at_legs, key=lambda name: at_legs[name].rod is None)
+    sensors = [at_legs[name] for name in names]
+    gauge = session.gauges[session.setups[names[0]].gauge]
+    equipment = replace(equipment, gauge=gauge, tip=None)
     equipment = replace(equipment, mounting=replace(sensors[0].mounting, stand=None))
     rods = tuple(dict.fromkeys(s.rod for s in sensors if s.rod is not None))
     if not rods:

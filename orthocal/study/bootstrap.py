@@ -24,6 +24,7 @@ from orthocal.estimation.weighting import leverages
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
+from orthocal.statistics.zeros import zero_shares
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once, require_counts
 
@@ -55,6 +56,7 @@ class BootstrapStudy(Study):
         session = self.session
         problem = CalibrationProblem(session, self.choice.select(session.robot.parameters))
         fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
+        problem = fit.problem  # with the noise of each gauge
         return _Prepared(
             fit=fit,
             values=problem.values,
@@ -86,7 +88,7 @@ class _Prepared:
     residuals: Array
     """Residuals rescaled to the noise, with mean 0, shape (n,), [m of the first gauge]."""
     cycles: tuple[tuple[NDArray[np.int64], ...], ...]
-    """Entries of each cycle of each setup, with the same order of postures in all cycles."""
+    """Entries of each cycle of each setup, with the same order of places in all cycles."""
     program: BatchSolver
 
     def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
@@ -152,12 +154,12 @@ def find_cycles(
         cycles = []
         for c in np.unique(cycle[of_setup]):
             entries = of_setup[cycle[of_setup] == c]
-            cycles.append(entries[np.argsort(observations.posture[entries], kind="stable")])
-        postures = {tuple(observations.posture[entries]) for entries in cycles}
+            cycles.append(entries[np.argsort(observations.place[entries], kind="stable")])
+        places = {tuple(observations.place[entries]) for entries in cycles}
         problem = "has one cycle of readings; expected several in each setup"
         if len(cycles) > 1:
-            problem = "has cycles with different postures; expected the same postures in each"
-        if len(cycles) < 2 or len(postures) > 1:
+            problem = "has cycles with different postures or conditions; expected the same in each"
+        if len(cycles) < 2 or len(places) > 1:
             raise SessionError(
                 f"{problem}, or --by residuals",
                 where=f"{session.path or 'session'}: setups.{setup_names[setup]}",
@@ -244,11 +246,7 @@ def _rescaled_residuals(fit: Fit) -> Array:
         sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
     ).covariance
     leverage = leverages(fit.jacobian, observations, covariance, fit.sigma)
-    share = (
-        1.0
-        - leverage
-        - 1.0 / np.bincount(observations.zero, minlength=observations.n_zeros)[observations.zero]
-    )
+    share = 1.0 - leverage - zero_shares(observations)[observations.zero]
     if not share.sum() > 1.0:
         raise SessionError(
             "has no residuals to resample: there are not more independent readings than "

@@ -31,6 +31,7 @@ from orthocal.estimation.linear import (
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.estimation.weighting import stated_sigma
+from orthocal.planning.expected_error import with_gauge_noise
 from orthocal.planning.first_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
@@ -254,7 +255,12 @@ class _Prepared:
         return next_theta, predictable
 
     def standard_errors(self, sigma: float) -> dict[str, float]:
-        """Largest standard error of an estimate by noise, for each method, [m, rad]."""
+        """Largest standard error of an estimate by noise, for each method, [m, rad].
+
+        Args:
+            sigma: Standard deviation of a reading of the first gauge, [m]. The others have their
+                own, by which readings are weighted.
+        """
         errors = {}
         for name, differences, covariance in self.paper_methods():
             matrix = self.matrices[len(differences)]
@@ -263,7 +269,10 @@ class _Prepared:
                 whiten = np.linalg.inv(np.linalg.cholesky(covariance))
             solution = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
             errors[name] = sigma * float(np.sqrt((solution**2).sum(axis=1).max()))
-        jacobian = self.linearisation.jacobian / self.problem.theta_scale
+        noise = np.ones(self.problem.observations.size)
+        if all(stated_sigma(g) > 0.0 for g in self.problem.session.gauges_with_readings.values()):
+            noise = with_gauge_noise(self.problem).noise_ratio
+        jacobian = self.linearisation.jacobian / noise[:, None] / self.problem.theta_scale
         variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
         general = sigma * float(np.sqrt(variances.max()))
         return {**errors, **dict.fromkeys(METHODS[3:], general)}
@@ -378,10 +387,18 @@ def _paper_differences(session: Session) -> Array:
 
 
 def _largest_difference(values: Array, problem: CalibrationProblem) -> Array:
-    """Largest difference of two entries with the same gauge zero, shape (n_sets,)."""
-    zero = problem.observations.zero
-    ranges = [np.ptp(values[:, zero == z], axis=1) for z in np.unique(zero)]
-    return np.asarray(np.max(ranges, axis=0))
+    """Largest difference of two entries with the same free zero, or entry with a known zero.
+
+    Shape (n_sets,).
+    """
+    o = problem.observations
+    sizes = [
+        np.abs(values[:, o.zero == z]).max(axis=1)
+        if o.zero_known[z]
+        else np.ptp(values[:, o.zero == z], axis=1)
+        for z in np.unique(o.zero)
+    ]
+    return np.asarray(np.max(sizes, axis=0))
 
 
 def _without_mounting_errors(sensor: Any) -> Any:  # noqa: ANN401 - any sensor with a mounting

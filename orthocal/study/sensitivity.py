@@ -20,7 +20,7 @@ from orthocal.observation.observations import drive_table
 from orthocal.planning.equipment import place_tool
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
-from orthocal.session.session import Gauge, Reading, Session
+from orthocal.session.session import Gauge, Reading, Session, describe_postures
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
@@ -64,8 +64,12 @@ class SensitivityStudy(Study):
                     changes_by_output.update(
                         {(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)}
                     )
+        approaches = dict(zip(observations.plus.tolist(), session.readings, strict=True))
         for i in range(observations.size):
-            key = postures[observations.posture[i]], setups[observations.setup[i]]
+            reading = approaches.get(i)
+            approach = None if reading is None else reading.approach
+            posture = describe_postures(postures[observations.posture[i]], None, approach)
+            key = posture, setups[observations.setup[i]]
             changes_by_output.setdefault(key, jacobian[i] * problem.noise_ratio[i])
         scales = np.array([p.prior_std * p.edge_factor for p in parameters])
         n = len(changes_by_output)

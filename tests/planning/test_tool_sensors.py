@@ -42,15 +42,16 @@ from orthocal.output.sheet.page import sheet_files
 from orthocal.output.text.plan import describe_absent, plan_json
 from orthocal.planning import planned_session, tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
-from orthocal.planning.equipment import Equipment, place_tool
+from orthocal.planning.equipment import Equipment, equipment_of, place_tool
 from orthocal.planning.expected_error import ToolForecast
+from orthocal.planning.first_plan import paper_plan
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.planned_session import _order_readings, build_session
 from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.planning.tool_candidates import list_tool_candidates, segment_distances
-from orthocal.sensors.ball_bar import SAGITTA
+from orthocal.sensors.ball_bar import SAGITTA, BallBar
 from orthocal.sensors.registry import read_setup
-from orthocal.session.session import Reading, Session, Setup
+from orthocal.session.session import Gauge, Reading, Session, Setup
 
 BAR = """sensor: ball_bar
 sigma_mm: 0.002
@@ -103,6 +104,21 @@ def planned(owned):
     equipment = Equipment(owned=sensors, **FEW)
     with few_balls(7), uncompared():
         return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
+
+
+def test_a_plan_beside_other_sensors_has_the_dial_of_the_legs(orthoglide):
+    """Whichever gauge is listed first."""
+    plan = paper_plan(orthoglide, Equipment())
+    bar = BallBar(length=50e-3, centre=(50e-3, 0.0, 0.0), ball="post")
+    gauges = {"bar": Gauge(1e-6, None, (-1e-3, 1e-3)), "dial": Gauge(10e-6, 10e-6, (-5e-3, 5e-3))}
+    setups = {name: replace(s, gauge="dial") for name, s in plan.setups.items()}
+    setups["bar"] = Setup("bar", bar, "bar", zero="known")
+    readings = (*plan.readings, Reading("bar", "zero"))
+    for order in (("bar", "dial"), ("dial", "bar")):
+        named = {name: gauges[name] for name in order}
+        session = replace(plan, gauges=named, setups=setups, readings=readings)
+        found = equipment_of(session.with_values(np.zeros(len(readings))), Equipment())
+        assert found.gauge == gauges["dial"]
 
 
 def test_every_candidate_posture_touches_its_artefact(owned, orthoglide):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from gauges import exact
+from effect_plans import effect_plan
+from gauges import exact, with_gauges
 
 from orthocal import load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError, SessionError
+from orthocal.observation.observations import build_observations
+from orthocal.session.session import Gauge
 from orthocal.study.bootstrap import build_bootstrap_study, find_cycles, summarise_bootstrap
 from orthocal.study.runner import run_study
 
@@ -42,6 +47,64 @@ def test_scatter_agrees_with_the_covariance(many_cycles, by):
         # the standard error of the width is 3.1 % with 1000 draws
         assert p.high - p.low == pytest.approx(2 * 1.96 * p.std, rel=0.08)
         assert p.standard_error == pytest.approx(p.std / np.sqrt(2 * 999), rel=1e-9)
+
+
+@pytest.mark.parametrize("order", [("coarse", "fine"), ("fine", "coarse")])
+def test_gauges_have_their_own_noise(many_cycles, order):
+    """One scatters ten times as much. Residuals are resampled in units of the noise."""
+    plan = many_cycles.select([r for r in many_cycles.readings if r.cycle <= FEWER_CYCLES])
+    gauges = {name: Gauge({"coarse": 20e-6, "fine": 2e-6}[name]) for name in order}
+    plan = with_gauges(plan, gauges, set(list(plan.setups)[:3]))
+    session = simulate_session(plan, {"x_slide.offset": 0.5e-3}, seed=1).session
+    study = build_bootstrap_study(session, "offsets", draws=400)
+    for p in summarise_bootstrap(study, run_study(study)).parameters:
+        assert p.low < p.estimate < p.high
+        assert p.std / p.predicted == pytest.approx(1.0, abs=0.3)
+        assert p.estimate == pytest.approx(
+            0.5e-3 if p.parameter.name == "x_slide.offset" else 0.0, abs=5.0 * p.std
+        )
+
+
+def test_a_known_zero_leaves_its_reading(many_cycles):
+    """Six absolute readings of three offsets have residuals to resample."""
+    chosen = [r for r in many_cycles.readings if r.cycle == 1 and r.posture.endswith("_max")]
+    setups = {name: replace(s, zero="known") for name, s in many_cycles.setups.items()}
+    few = replace(many_cycles.select(chosen), setups=setups)
+    assert [r.setup for r in chosen] == list(dict.fromkeys(r.setup for r in chosen))
+    prepared = build_bootstrap_study(few, "offsets", draws=2).prepare()
+    assert prepared.residuals.size == len(chosen)
+
+
+def test_cycles_in_another_order_of_approaches_are_the_same():
+    """A reading is replaced by one with its approach."""
+    plan = effect_plan("backlash")
+    first = [r for r in plan.readings if r.cycle == 1]
+    again = [replace(r, cycle=2) for r in reversed(first)]
+    both = replace(plan, readings=(*first, *again))
+    cycles = find_cycles(both, build_observations(both))
+    readings = both.readings
+    for one, other in cycles:
+        assert [(readings[i].posture, readings[i].approach) for i in one] == [
+            (readings[i].posture, readings[i].approach) for i in other
+        ]
+    turned = [replace(r, cycle=2, conditions=replace(r.conditions, approach="uuu")) for r in first]
+    with pytest.raises(SessionError, match="different postures or conditions"):
+        find_cycles(
+            replace(plan, readings=(*first, *turned)),
+            build_observations(replace(plan, readings=(*first, *turned))),
+        )
+
+
+def test_studies_of_other_orders_are_others(many_cycles):
+    """The first gauge is the unit of noise, and random numbers follow the order of setups."""
+    gauges = {"coarse": Gauge(20e-6), "fine": Gauge(2e-6)}
+    plan = with_gauges(many_cycles, gauges, set(list(many_cycles.setups)[:3]))
+    others = [
+        replace(plan, gauges=dict(reversed(gauges.items()))),
+        replace(plan, setups=dict(reversed(plan.setups.items()))),
+    ]
+    digests = {build_bootstrap_study(s, "offsets", draws=2).digest for s in (plan, plan, *others)}
+    assert len(digests) == 3
 
 
 def test_draws_consist_of_complete_cycles(raw_cycles):

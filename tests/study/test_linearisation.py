@@ -5,13 +5,15 @@ from __future__ import annotations
 import closed_form
 import numpy as np
 import pytest
-from gauges import exact
+from gauges import exact, with_gauges
 from tolerances import THREE_DECIMALS_MM
 
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import NotIdentifiableError, ParameterError
+from orthocal.estimation.linear import linearise_problem
+from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.session.session import Gauge
 from orthocal.study.linearisation import (
@@ -196,6 +198,23 @@ def test_paper_plan_requires_an_orthoglide(biglide):
 def test_invalid_arguments(orthoglide, arguments, error, message):
     with pytest.raises(error, match=message):
         build_linearisation_study(orthoglide, **arguments)
+
+
+def test_standard_errors_do_not_depend_on_the_order_of_gauges(root):
+    """Readings are weighted by the noise of their own gauge."""
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+    errors = []
+    for order in (("coarse", "fine"), ("fine", "coarse")):
+        gauges = {name: Gauge({"coarse": 20e-6, "fine": 2e-6}[name]) for name in order}
+        session = with_gauges(plan, gauges, set(list(plan.setups)[:3]))
+        study = build_linearisation_study(session, count=2, directions=2, largest=1.0)
+        errors.append(study.standard_errors["exact"])
+    sigma = np.array([2e-6 if i < 3 else 20e-6 for i in range(6)])
+    problem = build_problem(session, model="offsets")
+    jacobian = linearise_problem(problem).jacobian / problem.theta_scale
+    weighted = jacobian / sigma[problem.observations.setup][:, None]
+    expected = np.sqrt(np.linalg.inv(weighted.T @ weighted).diagonal().max())
+    assert errors == pytest.approx([expected] * 2, rel=1e-6)
 
 
 def test_unidentifiable_errors(orthoglide):

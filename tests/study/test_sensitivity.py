@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from effect_plans import effect_plan
 from machines import place
 
 from orthocal import load_plan
@@ -19,6 +20,21 @@ LENGTH = 0.31025
 def offsets(orthoglide):
     study = build_sensitivity_study(orthoglide, ["*.offset"])
     return summarise_sensitivity(study, run_study(study))
+
+
+def test_each_approach_has_its_row():
+    """Derivatives with respect to backlash have opposite signs from both sides."""
+    plan = effect_plan("backlash")
+    rows = [r for r in plan.readings if r.cycle == 1 and r.approach in ("ppp", "nnn")]
+    study = build_sensitivity_study(plan.select(rows), ["*.backlash"])
+    found = summarise_sensitivity(study, run_study(study))
+    labels = [posture for posture, output in found.rows if not output.startswith("tool")]
+    assert {text.rpartition("approach ")[2] for text in labels} == {"ppp)", "nnn)"}
+    by_row = dict(zip(found.rows, found.derivatives, strict=True))
+    for (posture, output), row in by_row.items():
+        other = by_row.get((posture.replace("ppp", "nnn"), output))
+        if "ppp" in posture and other is not None:
+            assert row == pytest.approx(-other)
 
 
 def row(summary, posture, reads):
