@@ -617,6 +617,26 @@ def test_a_setup_that_continues_keeps_its_temperature(folder, run):
     assert [r["temperature_C"] for r in rows_of(folder)][:2] == ["19", "19"]
 
 
+def test_a_corrected_typing_error_keeps_its_temperature(folder, run):
+    """The stand was moved since: the reading itself is that of before."""
+    with_effects(folder, "thermal")
+    run(folder, "20", "0.1", "0.2", "0.3")
+    code, out, _ = run(folder, "t 27", "back 2", "0.11")
+    assert code == 0, out
+    first, second, *_ = rows_of(folder)
+    assert (first["reading_mm"], first["temperature_C"]) == ("0.11", "20")
+    assert second["temperature_C"] == "20"
+
+
+def test_setups_of_a_dial_have_no_brackets(folder, run):
+    """They name the coordinates of points."""
+    plan = (folder / "session.yaml").read_text()
+    (folder / "session.yaml").write_text(plan.replace("yx:", "'y[1]':"))
+    code, _, err = run(folder, "0.1")
+    assert code == 2
+    assert "setups.y[1]: has brackets; expected a name without them" in " ".join(err.split())
+
+
 def test_unusual_temperatures_are_doubted_and_recorded(folder, run):
     """Such as a reading that is typed where the temperature is asked for."""
     with_effects(folder, "thermal")

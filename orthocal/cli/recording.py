@@ -218,9 +218,18 @@ class Dialogue:
     @property
     def _question(self) -> str | None:
         """Condition that is asked for before the reading."""
-        if self._asked is None:
+        if self._asked is None or self._keeps_conditions(self._asked):
             return None
         return self._conditions.question(self._recording.rows[self._asked])
+
+    def _keeps_conditions(self, index: int) -> bool:
+        """True for a reading that is not taken again, so that only its typing is corrected.
+
+        Another setup was read since, or the program was started anew.
+        """
+        row = self._recording.rows[index]
+        last = None if self._last is None else self._recording.rows[self._last]
+        return row.is_read and (last is None or last.setup != row.setup)
 
     def _show_again(self) -> None:
         self._shown = None
@@ -336,7 +345,8 @@ class Dialogue:
         """Record a reading, compare it with its prediction, and judge the readings if necessary."""
         recording = self._recording
         corrected = recording.rows[index].is_read
-        recording.read(index, value, self._conditions.of(recording.rows[index]))
+        conditions = self._conditions.of(recording.rows[index])
+        recording.read(index, value, None if self._keeps_conditions(index) else conditions)
         row = recording.rows[index]
         self._skipped -= {recording.rows[i].key for i in recording.point(index)}
         self._last = index
@@ -475,7 +485,8 @@ class Dialogue:
             return
         if arguments and (name not in row_commands or len(arguments) > 1):
             raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
-        if name == "again" and arguments and arguments[0] in self._dropped:
+        present = {str(r.line) for r in self._recording.rows}
+        if name == "again" and arguments and arguments[0] in self._dropped.keys() - present:
             self._restore(arguments[0])
         elif name in row_commands:
             row_commands[name](self._parse_row(arguments[0]) if arguments else None)

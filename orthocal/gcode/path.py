@@ -36,6 +36,10 @@ RELATIVE_RADIUS_TOLERANCE = 1e-3
 LARGEST_RADIUS_TOLERANCE = 127e-6
 """Upper limit of the relative tolerance, as in controllers, [m]."""
 
+FULL_TURN = 1e-6
+"""Angle between start and end below which an arc is a full circle, as for LinuxCNC, [rad]. Both
+points may have been computed differently, such as in G91 and G90."""
+
 SMALLEST_RADIUS = 1e-7
 """Smallest radius of an arc, [m]."""
 
@@ -208,9 +212,9 @@ def arc_about(
         )
     angle = math.atan2(first[1], first[0])
     sweep = math.atan2(last[1], last[0]) - angle
-    if start[i] == end[i] and start[j] == end[j]:
-        sweep = 0.0
     sweep %= 2.0 * math.pi
+    if min(sweep, 2.0 * math.pi - sweep) < FULL_TURN:
+        sweep = 0.0
     if clockwise:
         sweep -= 2.0 * math.pi
     elif sweep == 0.0:

@@ -14,6 +14,7 @@ from programs import Move, distances, own_distances, random_program, read_polyli
 from orthocal import GcodeError
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.lines import split_point_line
+from orthocal.gcode.path import arc_about
 from orthocal.gcode.program import ProgramCorrector
 
 WITHIN = 1e-6
@@ -502,3 +503,30 @@ def test_longest_written_line_is_what_linuxcnc_reads(line, end, tmp_path, monkey
         monkeypatch.setattr(program, "LONGEST_READ", 1000)
         with pytest.raises(subprocess.CalledProcessError):
             interpret(written(" " + longest)[0].split("\n"), tmp_path)
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+@pytest.mark.parametrize("turns", [1, 3])
+@pytest.mark.parametrize("off", [0.0, 1e-17, -1e-17, 1e-12, -1e-12])
+def test_a_full_circle_may_end_a_rounding_error_beside_its_start(clockwise, turns, off):
+    """Both points are computed, such as in G91 and then in G90."""
+    arc = arc_about(
+        (10e-3, 0.0, 0.0),
+        (10e-3, off, 0.0),
+        (5e-3, 0.0),
+        clockwise=clockwise,
+        plane=17,
+        turns=turns,
+        where="",
+    )
+    assert arc.sweep == pytest.approx((-1 if clockwise else 1) * turns * 2.0 * np.pi)
+    short = arc_about(
+        (10e-3, 0.0, 0.0),
+        (10e-3, -1e-6 if clockwise else 1e-6, 0.0),
+        (5e-3, 0.0),
+        clockwise=clockwise,
+        plane=17,
+        turns=1,
+        where="",
+    )
+    assert abs(short.sweep) == pytest.approx(2e-4, rel=1e-6)

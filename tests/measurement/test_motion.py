@@ -10,6 +10,7 @@ import re
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from orthocal import (
     draw_errors,
     export_calibration,
     load_plan,
+    load_robot,
     simulate_session,
 )
 from orthocal.builder.build import make_robot
@@ -32,10 +34,15 @@ from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.motion.approach import USUAL_LENGTH, approach_length
+from orthocal.measurement.motion.approach import (
+    USUAL_ANGLE,
+    USUAL_LENGTH,
+    approach_length,
+    approach_share,
+)
 from orthocal.measurement.motion.motion import plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
-from orthocal.session.session import Conditions, Reading
+from orthocal.session.session import Conditions, Gauge, Reading
 from orthocal.units import MM
 
 ROUNDED = 1e-4
@@ -76,6 +83,18 @@ def small(directory):
 @pytest.fixture(scope="module")
 def motions(small):
     return plan_motion(small)
+
+
+@pytest.mark.parametrize(("half_mm", "least_mrad"), [(0.2, 4.0), (5.0, 8.7)])
+def test_approaches_of_motors_take_up_their_backlash(root, half_mm, least_mrad):
+    """Twice its limit, also for a gauge of short range."""
+    robot = with_effects(load_robot(root / "examples/fivebar"), ["backlash"])
+    robot = robot.with_tolerances({"*.backlash_mrad": 2.0})
+    limits = (-half_mm * MM, half_mm * MM)
+    session = SimpleNamespace(robot=robot, gauges={"": Gauge(5e-6, 10e-6, limits)})
+    angle = approach_share(session) * USUAL_ANGLE
+    assert angle == pytest.approx(least_mrad * 1e-3, rel=0.01)
+    assert approach_length(session) == f"{np.rad2deg(angle):.3g}°"
 
 
 def read_program(text, robot):

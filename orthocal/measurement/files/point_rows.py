@@ -28,14 +28,18 @@ def split_points(session: Session) -> Session:
     """Session whose setups of points are split into three."""
     setups, gauges = {}, dict(session.gauges)
     for setup in session.setups.values():
-        if not isinstance(setup.sensor, Points) or setup.sensor.along is not None:
+        if isinstance(setup.sensor, Points) and setup.sensor.along is not None:
             setups[setup.name] = setup
             continue
         if "[" in setup.name or "]" in setup.name:
             raise SessionError(
-                "has brackets; expected a name without them for a setup of points",
+                "has brackets; expected a name without them, because they name the coordinates of "
+                "points",
                 where=f"{session.path or 'session'}: setups.{setup.name}",
             )
+        if not isinstance(setup.sensor, Points):
+            setups[setup.name] = setup
+            continue
         axis_setups, axis_gauges = split_setup(setup, session.gauges[setup.gauge])
         setups |= axis_setups
         gauges |= axis_gauges

@@ -54,34 +54,33 @@ def approach_share(session: Session) -> float:
     """Length of the approaches of a session, as a share of the usual length.
 
     The length is at most half the range of the gauges, so that the tip stays in contact. It is
-    never too short to take up the backlash.
+    never too short to take up the backlash of a drive.
     """
     ranges = [g.range for g in session.gauges.values() if g.range is not None]
     half_range = min((0.5 * (high - low) for low, high in ranges), default=USUAL_LENGTH)
-    backlash = max(
+    usual = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE}
+    least = max(
         (
-            LIMIT * session.robot.parameters[error.name].prior_std
+            APPROACH_PER_BACKLASH
+            * LIMIT
+            * session.robot.parameters[error.name].prior_std
+            / usual[error.unit]
             for effect in robot_effects(session.robot)
             if "approach" in effect.conditions
             for error in effect.errors
-            if error.unit == "m"
+            if error.unit in usual
         ),
         default=0.0,
     )
-    length = max(
-        math.floor(half_range / STEP + 1e-6) * STEP,
-        SHORTEST_APPROACH,
-        APPROACH_PER_BACKLASH * backlash,
-    )
-    return min(length / USUAL_LENGTH, 1.0)
+    length = max(math.floor(half_range / STEP + 1e-6) * STEP, SHORTEST_APPROACH)
+    return max(min(length / USUAL_LENGTH, 1.0), least)
 
 
 def approach_length(session: Session) -> str:
     """Length of the approaches of a session, as text with its unit."""
-    share = approach_share(session)
-    if any(d.unit == "m" for d in session.robot.drives):
-        return f"{share * USUAL_LENGTH / MM:.3g} mm"
-    return f"{share * USUAL_ANGLE / DEG:.3g}°"
+    share, units = approach_share(session), {d.unit for d in session.robot.drives}
+    texts = {"m": f"{share * USUAL_LENGTH / MM:.3g} mm", "rad": f"{share * USUAL_ANGLE / DEG:.3g}°"}
+    return " or ".join(text for unit, text in texts.items() if unit in units)
 
 
 def describe_approach(robot: Robot, approach: str) -> str:
