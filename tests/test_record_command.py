@@ -242,6 +242,11 @@ ENTRIES = {
         [""] * 6,
         "Added: line 8, yx x_max. Line 8: yx x_max (6 of 6 missing)",
     ),
+    "again of a line with the number of a dropped row": (
+        ["drop 7", "0.1", "again 2", "again 7"],
+        ["0.10"],
+        "Not recorded: line 7 was not read yet.",
+    ),
     "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
     "restart of an earlier setup": (
         ["0.1", "0.2", "0.3", "0.4", "restart 3", "0.5"],
