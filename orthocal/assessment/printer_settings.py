@@ -283,9 +283,10 @@ def _setting_rows(
     if FIRMWARES[settings.firmware].tilts:
         for axis, now, new in zip("xy", present.tilts, settings.tilts, strict=True):
             values.append((f"tilt along {axis}", now / PERCENT, new / PERCENT, PERCENT, "%"))
+    shown = uncertainties[: len(values)].tolist()
     return tuple(
-        SettingRow(name, now, new, float(u) / scale, unit)
-        for (name, now, new, scale, unit), u in zip(values, uncertainties.tolist(), strict=False)
+        SettingRow(name, now, new, u / scale, unit)
+        for (name, now, new, scale, unit), u in zip(values, shown, strict=True)
     )
 
 
