@@ -7,7 +7,7 @@ from orthocal.session.session import Reading
 
 
 class IndependentReadings:
-    """Readings and differences, each of which the previous ones of its setup and cycle lack."""
+    """Readings and differences of which none follows from others of its setup and cycle."""
 
     def __init__(self) -> None:
         self._absolute: set[tuple[str, int]] = set()

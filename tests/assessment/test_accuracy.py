@@ -366,6 +366,15 @@ def test_the_uncertainty_is_unknown_without_a_noise(experiment_2):
     assert assess_tool(identified(session)).after is None
 
 
+def test_machines_within_their_tolerances_have_no_other_scale():
+    plan = plan_of("raw-cycles")
+    plan = plan.with_gauge(replace(plan.gauge, range=None))
+    for seed in range(8):
+        errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=seed)
+        session = simulate_session(plan, errors, seed=seed).session
+        assert find_tolerance_scale(session).factor == 1.0, seed
+
+
 @pytest.mark.parametrize("sigma", [1e-5, 1e-4, 3e-4])
 def test_noise_does_not_increase_the_tolerance_scale(sigma):
     """A machine without errors except one offset."""

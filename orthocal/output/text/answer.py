@@ -440,10 +440,8 @@ def render_values(calibration: Calibration) -> RenderableType:
     table = entry_table(calibration, identified=not calibration.only_offsets)
     keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
     meaning = "Drive coordinate = encoder coordinate + offset."
-    explained = complete or not (
-        trusted and stated and not keep
-    )  # above this section, or not needed
-    notes = [meaning, *([] if explained else [NEW_NOTE])]
+    has_new = trusted and stated and not keep
+    notes = [meaning, *([NEW_NOTE] if has_new and not complete else [])]
     notes += [f.words for f in assessment.of_kind("controller not stated")]
     notes.append(EXPANDED)
     if trusted and not calibration.only_offsets:
