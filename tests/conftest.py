@@ -4,6 +4,7 @@ import atexit
 import gc
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -31,6 +32,9 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     atexit.register(shutil.rmtree, os.environ["ORTHOCAL_CACHE"], ignore_errors=True)
 # processes of tests need not compile what they import
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# a job in the background of a shell script ignores Ctrl-C, and so would its processes
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).parents[1]
 
