@@ -676,6 +676,42 @@ def test_side_of_approach_is_asked_for_if_the_plan_states_none(folder, run):
     assert [r["approach"] for r in rows_of(folder)][4:] == ["nnn", ""]
 
 
+def test_a_typed_side_is_corrected(folder, run):
+    """For the line that is asked for: with the reading, or by Enter alone."""
+    with_effects(folder, "backlash")
+    _, out, _ = run(folder, "p", "0.01", "back", "side n", "0.02", "0.03", "back 3", "side u", "")
+    assert "Recorded: line 2, yx zero ↓: 0.02 mm" in out
+    # without `side` a corrected reading keeps its approach
+    _, out, _ = run(folder, "n", "0.04", "side p", "back 2", "0.05", "back 4", "0.06")
+    approaches = [r["approach"] for r in rows_of(folder)]
+    assert approaches == ["nnn", "uuu", "nnn", "", "", ""]
+    assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
+    # later, and after another setup was read
+    _, out, _ = run(folder, "n", "0.07", "back 2", "side pnp", "0.05", "back 3", "side p", "")
+    assert "Noted with this reading and the next ones: approach pnp." in " ".join(out.split())
+    assert [r["approach"] for r in rows_of(folder)] == ["pnp", "ppp", "nnn", "nnn", "", ""]
+    assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
+
+
+def test_restart_deletes_typed_sides(folder, run):
+    """The same command asks for the side again."""
+    with_effects(folder, "backlash", TABLE + "yx,x_max,1,,\nyx,x_max,2,,\n")
+    run(folder, "0.01", "0.02", "0.03", "n", "0.04")
+    run(folder, "restart 2")
+    rows = rows_of(folder)
+    assert [r["approach"] for r in rows] == ["ppp", "nnn", "ppp", "ppp", "nnn", "", ""]
+    assert set(cells(folder)) == {""}
+    _, out, _ = run(folder, "0.01", "0.02", "0.03", "p", "0.04")
+    assert "From which side are the postures approached?" in out
+    assert rows_of(folder)[5]["approach"] == "ppp"
+
+
+def test_a_temperature_is_corrected_after_another_setup_was_read(folder, run):
+    with_effects(folder, "thermal")
+    run(folder, "20", "0.1", "0.2", "0.3", "30", "0.4", "back 2", "t 21", "")
+    assert [r["temperature_C"] for r in rows_of(folder)][:4] == ["21", "20", "20", "30"]
+
+
 def test_a_wrong_side_is_shown_as_it_was_typed(folder, run):
     with_effects(folder, "backlash")
     _, out, _ = run(folder, "side q", "side pq", "side ↑↓↑")
@@ -693,7 +729,7 @@ def test_a_planned_side_of_approach_stays(folder, run):
     head, *rows = file.read_text().splitlines()
     file.write_text("\n".join([f"{head},approach", *(f"{row},ppp" for row in rows), ""]))
     _, out, _ = run(folder, "side n", "0.02")
-    assert "Noted with the next readings" not in out
+    assert "Noted with" not in out
     assert "The plan states the side of this reading: ppp" in " ".join(out.split())
     assert [r["approach"] for r in rows_of(folder)] == ["ppp"] * 6
 

@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from typing import TypeGuard
 
@@ -21,11 +22,11 @@ from orthocal.hypotheses.search import find_suspected_rows
 from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading, plain_minus
 from orthocal.kinematics.conditions import APPROACH, find_approach_problem
 from orthocal.measurement.files.readings_checks import parse_temperature
-from orthocal.measurement.recording import Recording
+from orthocal.measurement.recording import RecordedReading, Recording
 from orthocal.observation.conditions import needed_conditions
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
 from orthocal.runtime.interrupts import raised_interrupt
-from orthocal.session.session import Conditions, Reading, ReadingKey
+from orthocal.session.session import Conditions, ReadingKey
 from orthocal.text import printable, shorten
 
 USUAL_C = 5.0, 45.0
@@ -66,7 +67,7 @@ class RecordedConditions:
         self._asked: set[str] = set()
         """Setups whose temperature was asked for."""
 
-    def question(self, row: Reading) -> str | None:
+    def question(self, row: RecordedReading) -> str | None:
         """Condition to ask for before a row is read; None if all are known."""
         if row.minus is not None:
             return None
@@ -84,7 +85,7 @@ class RecordedConditions:
         if self.temperature is None and temperatures:
             self.temperature = temperatures[-1]
 
-    def answer(self, question: str, text: str, row: Reading) -> None:
+    def answer(self, question: str, text: str, row: RecordedReading) -> None:
         """Store the answer to a question; an empty one accepts the proposed value.
 
         Raises:
@@ -120,16 +121,14 @@ class RecordedConditions:
             raise SessionError(f"the side is {problem}; or one of these letters for all drives")
         self.approach = letters
 
-    def of(self, row: Reading) -> Conditions | None:
-        """Conditions of a reading that is typed now; None if nothing is stated."""
+    def of(self, row: RecordedReading) -> Conditions:
+        """Conditions of a reading that is typed now, without a planned approach."""
         if row.minus is not None:
-            return None
-        stated = Conditions(
-            self.approach if row.approach is None else None, self.temperature, self._time(row)
-        )
-        return None if stated == Conditions() else stated
+            return Conditions()
+        approach = self.approach if row.planned_approach is None else None
+        return Conditions(approach, self.temperature, self._time(row))
 
-    def _time(self, row: Reading) -> datetime | None:
+    def _time(self, row: RecordedReading) -> datetime | None:
         """Time of the clock, with a time zone unless other readings have times without one.
 
         None if another reading of the setup has no time; then the order of the rows is assumed.
@@ -171,10 +170,12 @@ class Dialogue:
         """Setup that was described last."""
         self._last: int | None = None
         """Index of the row that was read last."""
-        self._dropped: dict[str, list[Reading]] = {}
+        self._dropped: dict[str, list[RecordedReading]] = {}
         """Deleted rows by their line."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
+        self._stated: set[str] = set()
+        """Conditions that were typed while this row is asked for."""
 
     def run(self) -> None:
         """Ask for readings until none is missing and Enter is typed, or the input ends."""
@@ -191,7 +192,7 @@ class Dialogue:
 
     def _ask_for(self, index: int | None) -> None:
         """Ask for a row; None if all are read or skipped."""
-        self._asked = index
+        self._asked, self._stated = index, set()
         self._show()
 
     def _ask_for_next(self) -> None:
@@ -230,6 +231,20 @@ class Dialogue:
         row = self._recording.rows[index]
         last = None if self._last is None else self._recording.rows[self._last]
         return row.is_read and (last is None or last.setup != row.setup)
+
+    def _conditions_of(self, index: int) -> Conditions:
+        """Conditions to record with a reading that is typed now; those that are None do not change.
+
+        A reading that exists already keeps its approach, unless another one was typed for it.
+        """
+        row = self._recording.rows[index]
+        present = self._conditions.of(row)
+        if not row.is_read:
+            return present
+        kept = (
+            {"approach", "temperature", "time"} if self._keeps_conditions(index) else {"approach"}
+        )
+        return replace(present, **dict.fromkeys(kept - self._stated))
 
     def _show_again(self) -> None:
         self._shown = None
@@ -301,9 +316,10 @@ class Dialogue:
 
     def _answer_question(self, question: str, word: str) -> None:
         """Store a condition, and ask for the next one or for the reading."""
-        row = self._recording.rows[self._require_row()]
-        self._conditions.answer(question, word, row)
-        self._note(self._text.conditions(self._conditions.of(row)))
+        index = self._require_row()
+        self._conditions.answer(question, word, self._recording.rows[index])
+        self._stated.add(question)
+        self._note(self._text.conditions(self._conditions_of(index)))
         self._doubt_temperature()
         if self._question is not None:
             self._note(self._text.question(self._question, self._conditions.temperature))
@@ -318,10 +334,11 @@ class Dialogue:
             row = self._recording.rows[self._asked]
             if name == "temperature":  # answers the question of this setup
                 self._conditions.answer("temperature", "", row)
-            elif row.approach is not None:
-                self._note(self._text.planned_side(row.approach))
+            elif row.planned_approach is not None:
+                self._note(self._text.planned_side(row.planned_approach))
                 return
-            self._note(self._text.conditions(self._conditions.of(row)))
+            self._stated.add("temperature" if name == "temperature" else "approach")
+            self._note(self._text.conditions(self._conditions_of(self._asked)))
             self._doubt_temperature()
 
     def _doubt_temperature(self) -> None:
@@ -331,7 +348,10 @@ class Dialogue:
             self._conditions.is_unusual = False
 
     def _keep(self) -> None:
-        """Keep the reading of the row that is asked for; end the dialogue if no row is."""
+        """Keep the reading of the row that is asked for, with the conditions typed for it.
+
+        The dialogue ends if no row is asked for.
+        """
         if self._asked is None:
             raise _EndOfDialogue
         if not self._recording.rows[self._asked].is_read:
@@ -339,14 +359,16 @@ class Dialogue:
             reading = f"the reading of the {self._text.instrument(self._asked)}"
             expected = "x, y and z of the point" if is_point else reading
             raise SessionError(f"type {expected}, or `skip`, or `help`")
-        self._ask_for_next()
+        if self._stated:
+            self._record(self._asked, self._recording.value(self._asked))
+        else:
+            self._ask_for_next()
 
     def _record(self, index: int, value: float | Array) -> None:
         """Record a reading, compare it with its prediction, and judge the readings if necessary."""
         recording = self._recording
         corrected = recording.rows[index].is_read
-        conditions = self._conditions.of(recording.rows[index])
-        recording.read(index, value, None if self._keeps_conditions(index) else conditions)
+        recording.read(index, value, self._conditions_of(index))
         row = recording.rows[index]
         self._skipped -= {recording.rows[i].key for i in recording.point(index)}
         self._last = index

@@ -9,10 +9,11 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
-from orthocal.measurement.files.point_rows import point_of
 from orthocal.measurement.motion.approach import (
     approach_length,
     common_approach,
@@ -94,14 +95,14 @@ class RecordingText:
             f"Enter: {programmed} ({arrow}), as the programs do. `side n` changes it later."
         )
 
-    def conditions(self, conditions: Conditions | None) -> str:
-        """Conditions that are noted with the next readings."""
+    def conditions(self, conditions: Conditions) -> str:
+        """Conditions that are noted with the reading that is asked for, and with the next ones."""
         noted = []
-        if conditions is not None and conditions.approach is not None:
+        if conditions.approach is not None:
             noted.append(f"approach {conditions.approach}")
-        if conditions is not None and conditions.temperature is not None:
+        if conditions.temperature is not None:
             noted.append(f"{conditions.temperature:g} °C")
-        return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
+        return f"Noted with this reading and the next ones: {', '.join(noted) or 'no temperature'}."
 
     def unusual_temperature(self, temperature: float) -> str:
         """Question whether a temperature, [°C], is right."""
@@ -257,10 +258,8 @@ class RecordingText:
 
     def value(self, index: int) -> str:
         """Reading of a row, or the coordinates of its point, in mm."""
-        part = [self._recording.rows[i] for i in self._recording.point(index)]
-        if len(part) == 1:
-            return show_mm(part[0].value)
-        return ", ".join(show_mm(v) for v in point_of(part, self._session.setups).tolist())
+        values = np.atleast_1d(self._recording.value(index))
+        return ", ".join(show_mm(v) for v in values.tolist())
 
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
