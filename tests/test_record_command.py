@@ -475,6 +475,13 @@ def test_gauge_is_aligned_in_the_stated_posture(folder, run):
     assert "x_min: joints x_slide 210.250 mm" in words
 
 
+def test_alignment_posture_stays_if_its_line_is_deleted(folder, run):
+    code, out, _ = run(folder, "drop 2", "0.1")
+    assert code == 0
+    assert "session.yaml states now that yx is aligned at zero." in out
+    assert load_session(folder, partial=True).alignment_postures == {"yx": "zero", "zx": "zero"}
+
+
 def test_recording_continues_after_an_interruption(folder, run):
     run(folder, "0.1", "skip", "0.3", "0.4", "quit")
     code, out, _ = run(folder, "0.2", "0.5", "0.6", "")

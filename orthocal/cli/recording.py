@@ -595,7 +595,7 @@ class Dialogue:
         index = self._require_row() if index is None else index
         rows = [self._recording.rows[i] for i in self._recording.point(index)]
         row, count = self._recording.rows[index], len(rows)
-        self._recording.drop(index)
+        stated = self._recording.drop(index)
         self._dropped[str(row.line)] = rows
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - count
@@ -603,6 +603,8 @@ class Dialogue:
             f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers. "
             f"`again {row.line}` adds it at the end."
         )
+        for setup, posture in stated.items():
+            self._note(f"session.yaml states now that {setup} is aligned at {posture}.")
         self._judge()
         self._ask_for_next()
 

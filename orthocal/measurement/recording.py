@@ -30,12 +30,13 @@ from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.io.documents import Keys, Number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
 from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
+from orthocal.measurement.files.session_edits import add_alignment, add_readings
 from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
@@ -361,17 +362,36 @@ class Recording:
         self._apply(Change(done="added", rows=[*(r.key for r in rows), *added]))
         return len(self.rows) - len(added)
 
-    def drop(self, index: int) -> None:
-        """Delete a row, or the three rows of a point.
+    def drop(self, index: int) -> dict[str, str]:
+        """Delete a row, or the three rows of a point; alignment postures do not change.
+
+        Returns:
+            Alignment postures by setup that the session.yaml states from now on, because the
+            remaining rows imply others.
 
         Raises:
-            SessionError: If no other row remains.
+            SessionError: If no other row remains, or a posture cannot be stated.
             OutputError: If the files cannot be written.
         """
         rows = self.point(index)
         if len(self.rows) == len(rows):
             raise SessionError("it is the only row; a session has at least one")
-        self._apply(Change(done="dropped", rows=[self.rows[i].key for i in rows]))
+        change = Change(done="dropped", rows=[self.rows[i].key for i in rows])
+        stated = self._state_alignment(change_rows(self.rows, change))
+        self._apply(change)
+        return stated
+
+    def _state_alignment(self, remaining: Sequence[Reading]) -> dict[str, str]:
+        """State the alignment postures in the session.yaml that the remaining rows would change."""
+        session = self.session
+        implied = replace(session, readings=tuple(remaining)).alignment_postures
+        changed = {n: p for n, p in session.alignment_postures.items() if p != implied[n]}
+        stated = {base_name(name): posture for name, posture in changed.items()}
+        if stated and session.path is not None:
+            write_file(session.path, add_alignment(session.path, stated))
+        aligned = {n: replace(session.setups[n], aligned_at=p) for n, p in changed.items()}
+        self.session = replace(session, setups={**session.setups, **aligned})
+        return stated
 
     def restore(self, dropped: Sequence[RecordedReading]) -> int:
         """Append deleted rows without their readings, and return the index of the first.
@@ -503,42 +523,21 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
 
 
 def _files_to_add(session: Session) -> dict[Path, bytes]:
-    """Files that turn a plan into a session: readings.csv, then session.yaml, which names it."""
-    if session.readings_path is not None or session.path is None:
-        return {}
-    csv, table = _csv_of(session), _table(session.readings, session)
-    return {csv: table, session.path: _yaml_with_readings(session.path, csv, table)}
-
-
-def _yaml_with_readings(file: Path, csv: Path, table: bytes) -> bytes:
-    """Content of a session.yaml with the key `readings` appended, otherwise unchanged.
-
-    Args:
-        file: The session.yaml, without readings.
-        csv: Path of the new readings.csv beside it.
-        table: Content of the readings.csv.
+    """Files that turn a plan into a session: readings.csv, then session.yaml, which names it.
 
     Raises:
-        SessionError: If the readings.csv exists with other rows, or the key cannot be appended.
+        SessionError: If the readings.csv has other rows, or the session.yaml cannot name it.
     """
+    if session.readings_path is not None or session.path is None:
+        return {}
+    file, csv, table = session.path, _csv_of(session), _table(session.readings, session)
     if exists(csv) and read_file(csv, error=SessionError) != table:
         raise SessionError(
             f"holds other rows than {file.name} plans and would be overwritten; move it away, or "
             f"add `readings: {csv.name}` to {file.name}",
             where=str(csv),
         )
-    content = read_file(file, error=SessionError)
-    extended = content.rstrip() + f"\nreadings: {csv.name}\n".encode()
-    expected = read_yaml(file, error=SessionError, content=content) | {"readings": csv.name}
-    try:
-        document = read_yaml(file, error=SessionError, content=extended)
-    except SessionError:
-        document = None
-    if document != expected:
-        raise SessionError(
-            f"is missing; add `readings: {csv.name}` to it", where=f"{file}: readings"
-        )
-    return extended
+    return {csv: table, file: add_readings(file, csv.name)}
 
 
 def _is_outdated(session: Session) -> bool:
