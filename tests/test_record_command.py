@@ -85,7 +85,7 @@ def test_words_of_the_instrument(folder, run, sensor, instrument):
     assert f"Type the reading of the {instrument} in mm" in done.stdout
     assert f"type the reading of the {instrument}," in done.stdout
     head = " ".join(done.stdout[: done.stdout.index("[mm]>")].split())
-    words = {"ball bar": "ball bar", "probe": "probe", "stand or the dial": "dial"}
+    words = {"ball bar": "ball bar", "probe": "probe", "gauge or its stand": "dial"}
     touched = [noun for text, noun in words.items() if f"do not touch the {text}" in head]
     assert touched == ([] if pairs else [instrument])
 
@@ -202,7 +202,7 @@ ENTRIES = {
     "back to an earlier setup": (
         [*["0.1"] * 4, "back 2", "0.2"],
         ["0.20", *["0.10"] * 3],
-        "The stand has been moved since yx was read: correct only typing errors",
+        "gauge or its stand has moved since, correct typing errors only, or type `restart 2`",
     ),
     "back after a repetition": (
         ["0.1", "again", "0.11", "back", "0.12"],
@@ -225,7 +225,7 @@ ENTRIES = {
     "again of an earlier setup": (
         ["0.1", "0.2", "0.3", "0.4", "again 2"],
         ["0.10", "0.20", "0.30", "0.40"],
-        "The stand has been moved since yx was read: read it once more only if",
+        "Another setup was read after yx. If the gauge or its stand has moved since",
     ),
     "again of nothing": (["again"], [], "Not recorded: nothing was read yet."),
     "again of an empty row": (["again 3"], [], "Not recorded: line 3 was not read yet."),
@@ -488,7 +488,7 @@ def test_recording_continues_after_an_interruption(folder, run):
     assert code == 0
     text = " ".join(out.split())
     assert "3 are recorded" in text
-    assert "This setup has readings. If the stand or the dial has moved since" in text
+    assert "This setup has readings. If the gauge or its stand has moved since" in text
     assert cells(folder) == ["0.10", "0.20", "0.30", "0.40", "0.50", "0.60"]
     assert "State in session.yaml which offsets are active in the controller" in text
     load_session(folder)

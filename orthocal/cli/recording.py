@@ -547,7 +547,7 @@ class Dialogue:
             raise SessionError("this is the first line")
         index = self._recording.point(index)[0]
         if rows[index].is_read:
-            self._note_moved(index, "correct only typing errors")
+            self._note_moved(index)
         self._ask_for(index)
 
     def _before(self, asked: int) -> int:
@@ -557,14 +557,12 @@ class Dialogue:
             return self._last
         return asked - 1
 
-    def _note_moved(self, index: int, advice: str) -> None:
+    def _note_moved(self, index: int) -> None:
         """Print advice about the setup of a row, if another setup was read since."""
-        setup = self._recording.rows[index].setup
-        if self._last is not None and self._recording.rows[self._last].setup != setup:
-            self._note(
-                f"The stand has been moved since {setup} was read: {advice}. To read there again, "
-                f"type `restart {self._recording.rows[index].line}`."
-            )
+        rows = self._recording.rows
+        others = self._last is not None and rows[self._last].setup != rows[index].setup
+        if others and (advice := self._text.moved(index)):
+            self._note(advice)
 
     def _again(self, index: int | None) -> None:
         rows = self._recording.rows
@@ -577,7 +575,7 @@ class Dialogue:
             raise SessionError("nothing was read yet")
         if not rows[index].is_read:
             raise SessionError(f"line {rows[index].line} was not read yet")
-        self._note_moved(index, "read it once more only if the stand was not moved")
+        self._note_moved(index)
         line = rows[index].line
         index = self._recording.repeat(index)
         self._note(f"Added: line {self._recording.rows[index].line}, which repeats line {line}.")

@@ -47,7 +47,7 @@ COMMANDS = {
     "again": "read the last line once more, as another cycle; `again 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
-    "restart": "delete the readings of this setup and read it again, if the gauge has moved; "
+    "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
     "`restart 7` the setup of line 7",
     "temperature": "temperature of the following readings in °C, such as `t 22.5`",
     "side": "side of approach of the following readings where the plan states none: `side n`",
@@ -190,6 +190,21 @@ class RecordingText:
         """Noun for what shows the reading of a row."""
         return instrument(self._session.setups[self._recording.rows[index].setup].sensor)
 
+    def moved(self, index: int) -> str:
+        """Advice for a row of a setup after which another setup was read.
+
+        Empty if the setup has no gauge that stays in its place.
+        """
+        row = self._recording.rows[index]
+        setup, name = self._session.setups[row.setup], self.name(row)
+        if reads_pairs(setup.sensor):
+            return ""
+        return (
+            f"Another setup was read after {name}. If the {_name_gauge(setup, stand=True)} has "
+            f"moved since, correct typing errors only, or type `restart {row.line}` to read {name} "
+            "again."
+        )
+
     def setup(self, name: str) -> str:
         """Position of the gauge of a setup, and preparation of its dial."""
         session, rows = self._session, self._recording.rows
@@ -204,19 +219,18 @@ class RecordingText:
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
         parts = [f"Place: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
-        noun = instrument(setup.sensor)
-        gauge = "stand or the dial" if noun == "dial" else noun
+        gauge, gauge_or_stand = _name_gauge(setup), _name_gauge(setup, stand=True)
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
-                f"This setup has readings. If the {gauge} has moved since, `restart` the setup."
+                f"This setup has readings. If the {gauge_or_stand} has moved since, `restart` the "
+                "setup."
             )
         elif isinstance(setup.sensor, Points):
             parts.append("From then on do not touch the instrument until the setup is complete.")
         elif not reads_pairs(setup.sensor):
             parts.append(
-                f"Go to {aligned} and align the {'gauge' if noun == 'dial' else noun}. {go}"
-                f"{set_dial(session, setup.name)} From then on do not touch the {gauge} until the "
-                "setup is complete."
+                f"Go to {aligned} and align the {gauge}. {go}{set_dial(session, name)} From then "
+                f"on do not touch the {gauge_or_stand} until the setup is complete."
             )
         if all(map(session.is_difference, of_setup)):
             parts.append(
@@ -454,6 +468,12 @@ class RecordingText:
 def show_mm(value: float) -> str:
     """A reading in mm with all its decimals, two at least."""
     return trim_zeros(f"{to_mm(value) + 0.0:.6f}")
+
+
+def _name_gauge(setup: Setup, *, stand: bool = False) -> str:
+    """Noun for the gauge of a setup; also for the stand of an indicator on request."""
+    noun = instrument(setup.sensor)
+    return f"gauge{' or its stand' * stand}" if noun == "dial" else noun
 
 
 def _gauge(session: Session, setup: Setup) -> str:
