@@ -205,45 +205,50 @@ ENTRIES = {
         "gauge or its stand has moved since, correct typing errors only, or type `restart 2`",
     ),
     "back after a repetition": (
-        ["0.1", "again", "0.11", "back", "0.12"],
+        ["0.1", "repeat", "0.11", "back", "0.12"],
         ["0.10", *[""] * 5, "0.12"],
         "Recorded: 0.11 mm; Enter keeps it.",
     ),
     "back beyond": (["back"], [], "Not recorded: this is the first line."),
     "back to none": (["back 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
     "back to a word": (["back to"], [], "Not recorded: 'to' is not a line; expected 2 to 7."),
-    "again": (
-        ["0.1", "again", "0.11"],
+    "repeat": (
+        ["0.1", "repeat", "0.11"],
         ["0.10", "", "", "", "", "", "0.11"],
         "Line 8: yx zero, cycle 2 (6 of 7 missing)",
     ),
-    "again of a row": (
-        ["0.1", "0.2", "again 2", "0.11", "0.3"],
+    "repeat of a row": (
+        ["0.1", "0.2", "repeat 2", "0.11", "0.3"],
         ["0.10", "0.20", "0.30", "", "", "", "0.11"],
         "Added: line 8, which repeats line 2. Line 8: yx zero, cycle 2",
     ),
-    "again of an earlier setup": (
-        ["0.1", "0.2", "0.3", "0.4", "again 2"],
+    "repeat of an earlier setup": (
+        ["0.1", "0.2", "0.3", "0.4", "repeat 2"],
         ["0.10", "0.20", "0.30", "0.40"],
         "Another setup was read after yx. If the gauge or its stand has moved since",
     ),
-    "again of nothing": (["again"], [], "Not recorded: nothing was read yet."),
-    "again of an empty row": (["again 3"], [], "Not recorded: line 3 was not read yet."),
+    "repeat of nothing": (["repeat"], [], "Not recorded: nothing was read yet."),
+    "repeat of an empty row": (["repeat 3"], [], "Not recorded: line 3 was not read yet."),
     "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: line 2"),
     "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Line 4: yx x_min (4 of 5 missing)"),
     "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Line 4: yx x_min (4 of 5 missing)"),
-    "again of a dropped row": (
-        ["0.1", "drop 3", "again 3", "0.2"],
+    "back to a dropped row": (
+        ["0.1", "drop 3", "back 3", "0.2"],
         ["0.10", "", "", "", "", "0.20"],
-        "`again 3` adds it at the end. Line 4: yx x_min (4 of 5 missing)",
+        "`back 3` adds it again, as the last line. Line 4: yx x_min (4 of 5 missing)",
     ),
-    "again of a dropped row twice": (
-        ["drop 3", "again 3", "again 3"],
+    "back to a dropped row twice": (
+        ["drop 3", "back 3", "back 3"],
         [""] * 6,
-        "Added: line 8, yx x_max. Line 8: yx x_max (6 of 6 missing)",
+        "Not recorded: '3' is not a line; expected 2 to 8.",
     ),
-    "again of a line with the number of a dropped row": (
-        ["drop 7", "0.1", "again 2", "again 7"],
+    "repeat of a dropped row": (
+        ["0.1", "drop 2", "repeat 2"],
+        [""] * 5,
+        "Not recorded: '2' is not a line; expected 3 to 7.",
+    ),
+    "repeat of a line with the number of a dropped row": (
+        ["drop 7", "0.1", "repeat 2", "repeat 7"],
         ["0.10"],
         "Not recorded: line 7 was not read yet.",
     ),
@@ -256,7 +261,7 @@ ENTRIES = {
     "restart of nothing": (["restart 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
     "list": (["0.1", "list"], ["0.10"], "3 yx x_max: not read"),
     "show": (["show"], [], "Setup yx, 1 of 2"),
-    "help": (["help"], [], "again: read the last line once more, as another cycle"),
+    "help": (["help"], [], "repeat: read the last line once more, as another cycle"),
     "?": (["?"], [], "Ctrl-D and Ctrl-C end, too."),
     "quit": (["quit", "0.1"], [], "6 of 6 readings are missing"),
     "exit": (["exit", "0.1"], [], "6 of 6 readings are missing"),
@@ -766,7 +771,7 @@ def test_times_are_recorded_while_the_clock_runs(folder, run):
     _, out, _ = run(folder, "clock", "0.05")
     assert rows_of(folder)[4]["time"]
     # the first setup has a reading without a time
-    _, out, _ = run(folder, "clock", "again 2", "0.06")
+    _, out, _ = run(folder, "clock", "repeat 2", "0.06")
     assert rows_of(folder)[-1]["time"] == ""
 
 

@@ -497,42 +497,54 @@ class Dialogue:
         if len(names) != 1:
             which = f" ({' or '.join(names)}?)" if names else ""
             raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
-        name = names[0]
-        row_commands = {
-            **{"back": self._back, "again": self._again},
+        name, argument = names[0], arguments[0] if arguments else ""
+        examples = {"temperature": "21.5", "side": "p or n"}
+        actions = {
+            **{"skip": self._skip, "clock": self._switch_clock, "list": self._list},
+            **{"show": self._show_again, "help": self._help, "quit": self._quit},
+        }
+        if len(arguments) > (name not in actions):
+            raise SessionError(f"`{name}` has no argument '{shorten(arguments[-1])}'")
+        if name in actions:
+            actions[name]()
+        elif name not in examples:
+            self._row_command(name, argument)
+        elif argument:
+            self._set_condition(name, argument)
+        else:
+            raise SessionError(f"`{name}` needs a value, such as {examples[name]}")
+
+    def _row_command(self, name: str, line: str) -> None:
+        """Execute a command for a line; "" for the line that the command chooses.
+
+        Raises:
+            SessionError: If there is no such line, or the command cannot be executed now.
+        """
+        lines = [str(row.line) for row in self._recording.rows]
+        if name == "back" and line in self._dropped and line not in lines:
+            self._restore(line)
+            return
+        if line and line not in lines:
+            expected = f"{lines[0]} to {lines[-1]}"
+            raise SessionError(f"'{shorten(line)}' is not a line; expected {expected}")
+        commands = {
+            **{"back": self._back, "repeat": self._repeat},
             **{"drop": self._drop, "restart": self._restart},
         }
-        if name in ("temperature", "side") and len(arguments) == 1:
-            self._set_condition(name, arguments[0])
-            return
-        if arguments and (name not in row_commands or len(arguments) > 1):
-            raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
-        present = {str(r.line) for r in self._recording.rows}
-        if name == "again" and arguments and arguments[0] in self._dropped.keys() - present:
-            self._restore(arguments[0])
-        elif name in row_commands:
-            row_commands[name](self._parse_row(arguments[0]) if arguments else None)
-        elif name == "list":
-            self._say(self._text.list_rows())
-        elif name == "help":
-            self._say(self._text.list_commands())
-        elif name == "quit":
-            raise _EndOfDialogue
-        elif name in ("temperature", "side"):
-            example = "21.5" if name == "temperature" else "p or n"
-            raise SessionError(f"`{name}` needs a value, such as {example}")
-        elif name == "clock":
-            self._conditions.clock = not self._conditions.clock
-            self._note(self._text.clock(on=self._conditions.clock))
-        else:
-            {"skip": self._skip, "show": self._show_again}[name]()
+        commands[name](lines.index(line) if line else None)
 
-    def _parse_row(self, text: str) -> int:
-        """Index of a row from its line."""
-        lines = [str(row.line) for row in self._recording.rows]
-        if text in lines:
-            return lines.index(text)
-        raise SessionError(f"'{shorten(text)}' is not a line; expected {lines[0]} to {lines[-1]}")
+    def _switch_clock(self) -> None:
+        self._conditions.clock = not self._conditions.clock
+        self._note(self._text.clock(on=self._conditions.clock))
+
+    def _list(self) -> None:
+        self._say(self._text.list_rows())
+
+    def _help(self) -> None:
+        self._say(self._text.list_commands())
+
+    def _quit(self) -> None:
+        raise _EndOfDialogue
 
     def _require_row(self) -> int:
         if self._asked is None:
@@ -564,7 +576,7 @@ class Dialogue:
         if others and (advice := self._text.moved(index)):
             self._note(advice)
 
-    def _again(self, index: int | None) -> None:
+    def _repeat(self, index: int | None) -> None:
         rows = self._recording.rows
         if index is None:
             before = [i for i, r in enumerate(rows[: self._asked]) if r.is_read]
@@ -599,7 +611,7 @@ class Dialogue:
             self._last = None if self._last == index else self._last - count
         self._note(
             f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers. "
-            f"`again {row.line}` adds it at the end."
+            f"`back {row.line}` adds it again, as the last line."
         )
         for setup, posture in stated.items():
             self._note(f"session.yaml states now that {setup} is aligned at {posture}.")
@@ -617,7 +629,7 @@ class Dialogue:
         if index is None:
             index = self._last if self._asked is None else self._asked
         if index is None:
-            raise SessionError("no line is asked for; `restart 7` repeats the setup of line 7")
+            raise SessionError("no line is asked for; `restart 7` reads the setup of line 7 again")
         recording = self._recording
         setup = self._text.name(recording.rows[index])
         recording.empty(index)

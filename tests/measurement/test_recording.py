@@ -425,7 +425,7 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
         for value in rng.integers(-400, 400, size=1500):
             text.append(f"{value / 100:.2f}")
             if value % 7 == 0:
-                text += ["again", f"{value / 100 + 0.01:.2f}"]
+                text += ["repeat", f"{value / 100 + 0.01:.2f}"]
             if value % 11 == 0:
                 text += ["back", f"{value / 100 - 0.01:.2f}"]
         os.write(lines_in, ("\n".join(text) + "\n").encode()[:60_000])

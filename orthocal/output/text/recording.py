@@ -43,8 +43,8 @@ GLUE = "\u00a0"
 """Space at which no line ends."""
 
 COMMANDS = {
-    "back": "correct the reading before; `back 7` line 7",
-    "again": "read the last line once more, as another cycle; `again 7` line 7",
+    "back": "correct the reading before; `back 7` line 7, also after `drop 7`",
+    "repeat": "read the last line once more, as another cycle; `repeat 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
