@@ -85,36 +85,34 @@ class RecordedConditions:
         if self.temperature is None and temperatures:
             self.temperature = temperatures[-1]
 
-    def answer(self, question: str, text: str, row: RecordedReading) -> None:
-        """Store the answer to a question; an empty one accepts the proposed value.
+    def set_condition(self, condition: str, text: str, row: RecordedReading | None) -> None:
+        """Set a condition of the following readings.
+
+        Args:
+            condition: "approach" or "temperature".
+            text: The condition as typed; "" accepts the proposed value.
+            row: Row that is asked for; its setup needs no question about the temperature then.
 
         Raises:
-            SessionError: If the answer is invalid.
+            SessionError: If the text is invalid.
         """
-        if question == "approach":
-            self.set_approach(text or self.programmed)
+        if condition == "approach":
+            self._set_approach(text or self.programmed)
             return
         if text:
-            self.set_temperature(text)
-        self._asked.add(row.setup)
+            self._set_temperature(text)
+        if row is not None:
+            self._asked.add(row.setup)
 
-    def set_temperature(self, text: str) -> None:
-        """Set the temperature of the following readings, [°C].
-
-        Raises:
-            SessionError: If the temperature is not that of a workshop.
-        """
+    def _set_temperature(self, text: str) -> None:
+        """Set the temperature, [°C]; refuse one that no workshop has."""
         number = plain_minus(text).replace(",", ".")
         before, self.temperature = self.temperature, parse_temperature(number, "the temperature")
         change = abs(self.temperature - before) if _is_usual(before) else 0.0
         self.is_unusual = not _is_usual(self.temperature) or change > USUAL_CHANGE
 
-    def set_approach(self, text: str) -> None:
-        """Set the approach of the following readings: one letter for each drive, or for all.
-
-        Raises:
-            SessionError: If the letters are wrong.
-        """
+    def _set_approach(self, text: str) -> None:
+        """Set the approach: one letter for each drive, or for all."""
         robot = self._recording.session.robot
         letters = text * len(robot.drives) if text in APPROACH else text
         if problem := find_approach_problem(letters, robot):
@@ -228,9 +226,15 @@ class Dialogue:
 
         Another setup was read since, or the program was started anew.
         """
-        row = self._recording.rows[index]
-        last = None if self._last is None else self._recording.rows[self._last]
-        return row.is_read and (last is None or last.setup != row.setup)
+        is_past = self._last is None or self._is_of_earlier_setup(index)
+        return self._recording.rows[index].is_read and is_past
+
+    def _is_of_earlier_setup(self, index: int) -> bool:
+        """True for a row after whose setup this program recorded another setup."""
+        if self._last is None:
+            return False
+        last, row = (self._text.name(self._recording.rows[i]) for i in (self._last, index))
+        return last != row
 
     def _conditions_of(self, index: int) -> Conditions:
         """Conditions to record with a reading that is typed now; those that are None do not change.
@@ -241,9 +245,9 @@ class Dialogue:
         present = self._conditions.of(row)
         if not row.is_read:
             return present
-        kept = (
-            {"approach", "temperature", "time"} if self._keeps_conditions(index) else {"approach"}
-        )
+        kept = {"approach"}
+        if self._keeps_conditions(index):
+            kept |= {"temperature", "time"}
         return replace(present, **dict.fromkeys(kept - self._stated))
 
     def _show_again(self) -> None:
@@ -291,7 +295,9 @@ class Dialogue:
         word, *arguments = line.split() or [""]
         try:
             if self._question is not None and self._is_answer(word, arguments):
-                self._answer_question(self._question, word)
+                self._set_condition(self._question, word)
+                if self._question is not None:
+                    self._note(self._text.question(self._question, self._conditions.temperature))
             elif not word:
                 self._keep()
             elif word[0].isalpha() or word == "?":
@@ -314,35 +320,17 @@ class Dialogue:
             return True
         return not (word and (word[0].isalpha() or word == "?"))
 
-    def _answer_question(self, question: str, word: str) -> None:
-        """Store a condition, and ask for the next one or for the reading."""
-        index = self._require_row()
-        self._conditions.answer(question, word, self._recording.rows[index])
-        self._stated.add(question)
-        self._note(self._text.conditions(self._conditions_of(index)))
-        self._doubt_temperature()
-        if self._question is not None:
-            self._note(self._text.question(self._question, self._conditions.temperature))
-
-    def _set_condition(self, name: str, text: str) -> None:
-        """Set a condition of the following readings."""
-        if name == "temperature":
-            self._conditions.set_temperature(text)
-        else:
-            self._conditions.set_approach(text)
-        if self._asked is not None:
-            row = self._recording.rows[self._asked]
-            if name == "temperature":  # answers the question of this setup
-                self._conditions.answer("temperature", "", row)
-            elif row.planned_approach is not None:
-                self._note(self._text.planned_side(row.planned_approach))
-                return
-            self._stated.add("temperature" if name == "temperature" else "approach")
-            self._note(self._text.conditions(self._conditions_of(self._asked)))
-            self._doubt_temperature()
-
-    def _doubt_temperature(self) -> None:
-        """Ask whether an unusual temperature is right."""
+    def _set_condition(self, condition: str, text: str) -> None:
+        """Set a condition of the reading that is asked for, and of the following ones."""
+        row = None if self._asked is None else self._recording.rows[self._asked]
+        self._conditions.set_condition(condition, text, row)
+        if self._asked is None or row is None:
+            return
+        if condition == "approach" and row.planned_approach is not None:
+            self._note(self._text.planned_side(row.planned_approach))
+            return
+        self._stated.add(condition)
+        self._note(self._text.conditions(self._conditions_of(self._asked)))
         if self._conditions.is_unusual and self._conditions.temperature is not None:
             self._note(self._text.unusual_temperature(self._conditions.temperature))
             self._conditions.is_unusual = False
@@ -392,7 +380,7 @@ class Dialogue:
 
     def _contradicts(self, index: int) -> bool:
         """Print the prediction of a row; True if its value contradicts it."""
-        if not self._can_judge or not self._recording.is_located:
+        if not self._is_judged:
             return False
         rows = self._recording.rows
         excluded = self._rows_with_warning() - set(self._recording.point(index))
@@ -409,6 +397,12 @@ class Dialogue:
         if is_far(rows[index].value, mean, std):
             self._far.add(rows[index].key)
         return is_doubtful(session, position, mean, std)
+
+    @property
+    def _is_judged(self) -> bool:
+        """True if there are readings that can be judged."""
+        is_empty = len(self._recording.missing) == len(self._recording.rows)
+        return self._can_judge and not is_empty and self._recording.is_located
 
     def _rows_with_warning(self) -> set[int]:
         """Indices of the rows that present or hidden findings name."""
@@ -439,8 +433,7 @@ class Dialogue:
             True if there are new warnings.
         """
         recording = self._recording
-        is_empty = len(recording.missing) == len(recording.rows)
-        if not self._can_judge or is_empty or not recording.is_located:
+        if not self._is_judged:
             self._warnings = self._hidden = ()
             return False
         try:
@@ -510,7 +503,7 @@ class Dialogue:
         elif name not in examples:
             self._row_command(name, argument)
         elif argument:
-            self._set_condition(name, argument)
+            self._set_condition("approach" if name == "side" else name, argument)
         else:
             raise SessionError(f"`{name}` needs a value, such as {examples[name]}")
 
@@ -571,9 +564,7 @@ class Dialogue:
 
     def _note_moved(self, index: int) -> None:
         """Print advice about the setup of a row, if another setup was read since."""
-        rows = self._recording.rows
-        others = self._last is not None and rows[self._last].setup != rows[index].setup
-        if others and (advice := self._text.moved(index)):
+        if self._is_of_earlier_setup(index) and (advice := self._text.moved(index)):
             self._note(advice)
 
     def _repeat(self, index: int | None) -> None:

@@ -353,7 +353,7 @@ class Recording:
             raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
         same_setup = [r for r in self.rows if r.setup == row.setup]
         difference = self.session.is_difference(row)
-        cycle = 1 + max(r.cycle for r in same_setup if difference or _is_repeated(r, row))
+        cycle = 1 + max(r.cycle for r in same_setup if difference or _has_same_cycles(row, r))
         in_cycle = [r for r in same_setup if r.cycle == cycle]
         if any(self.session.is_difference(r) != difference for r in in_cycle):
             cycle = 1 + max(r.cycle for r in same_setup)
@@ -460,10 +460,13 @@ def _conditions_to_state(row: RecordedReading, conditions: Conditions) -> Condit
     return None if stated == Conditions() else stated
 
 
-def _is_repeated(row: RecordedReading, by: RecordedReading) -> bool:
-    """True if a row repeats another one, or may do so before its approach is typed."""
-    same_side = by.planned_approach in (None, row.approach)
-    return (row.posture, row.minus) == (by.posture, by.minus) and same_side
+def _has_same_cycles(row: RecordedReading, other: RecordedReading) -> bool:
+    """True if the cycles of another row and of repetitions of a row are counted together.
+
+    Both belong to the same postures. The approach of the repetitions may be typed later.
+    """
+    same_side = row.planned_approach in (None, other.approach)
+    return (row.posture, row.minus) == (other.posture, other.minus) and same_side
 
 
 @contextmanager

@@ -109,13 +109,13 @@ class RecordingText:
         return f"Is {temperature:g} °C the temperature of the machine? Otherwise type it: `t 20`."
 
     def planned_side(self, approach: str) -> str:
-        """The plan states the side of a reading, so that it cannot be set."""
+        """Refusal of a side for a reading whose approach the plan states."""
         return (
             f"The plan states the side of this reading: {approach}. `side` changes no such reading."
         )
 
     def clock(self, *, on: bool) -> str:
-        """True if the time of each reading is noted."""
+        """Answer to the command that begins or stops noting the times of readings."""
         if on:
             return "The time of each reading is noted."
         return "The time is not noted; lines count as read in their order, a minute apart."
