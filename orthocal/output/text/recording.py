@@ -49,8 +49,8 @@ COMMANDS = {
     "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
     "`restart 7` the setup of line 7",
-    "temperature": "temperature of the following readings in °C, such as `t 22.5`",
-    "side": "side of approach of the following readings where the plan states none: `side n`",
+    "temperature": "temperature in °C of this reading and the next ones, such as `t 22.5`",
+    "side": "approach of this reading and the next ones, unless the plan states it: `side n`",
     "clock": "begin or stop to note the time of each reading; stop if you type from paper",
     "list": "all lines and their readings",
     "show": "this setup and posture once more",
