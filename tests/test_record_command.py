@@ -85,7 +85,7 @@ def test_words_of_the_instrument(folder, run, sensor, instrument):
     assert f"Type the reading of the {instrument} in mm" in done.stdout
     assert f"type the reading of the {instrument}," in done.stdout
     head = " ".join(done.stdout[: done.stdout.index("[mm]>")].split())
-    words = {"ball bar": "ball bar", "probe": "probe", "stand or the dial": "dial"}
+    words = {"ball bar": "ball bar", "probe": "probe", "gauge or its stand": "dial"}
     touched = [noun for text, noun in words.items() if f"do not touch the {text}" in head]
     assert touched == ([] if pairs else [instrument])
 
@@ -202,48 +202,53 @@ ENTRIES = {
     "back to an earlier setup": (
         [*["0.1"] * 4, "back 2", "0.2"],
         ["0.20", *["0.10"] * 3],
-        "The stand has been moved since yx was read: correct only typing errors",
+        "gauge or its stand has moved since, correct typing errors only, or type `restart 2`",
     ),
     "back after a repetition": (
-        ["0.1", "again", "0.11", "back", "0.12"],
+        ["0.1", "repeat", "0.11", "back", "0.12"],
         ["0.10", *[""] * 5, "0.12"],
         "Recorded: 0.11 mm; Enter keeps it.",
     ),
     "back beyond": (["back"], [], "Not recorded: this is the first line."),
     "back to none": (["back 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
     "back to a word": (["back to"], [], "Not recorded: 'to' is not a line; expected 2 to 7."),
-    "again": (
-        ["0.1", "again", "0.11"],
+    "repeat": (
+        ["0.1", "repeat", "0.11"],
         ["0.10", "", "", "", "", "", "0.11"],
         "Line 8: yx zero, cycle 2 (6 of 7 missing)",
     ),
-    "again of a row": (
-        ["0.1", "0.2", "again 2", "0.11", "0.3"],
+    "repeat of a row": (
+        ["0.1", "0.2", "repeat 2", "0.11", "0.3"],
         ["0.10", "0.20", "0.30", "", "", "", "0.11"],
         "Added: line 8, which repeats line 2. Line 8: yx zero, cycle 2",
     ),
-    "again of an earlier setup": (
-        ["0.1", "0.2", "0.3", "0.4", "again 2"],
+    "repeat of an earlier setup": (
+        ["0.1", "0.2", "0.3", "0.4", "repeat 2"],
         ["0.10", "0.20", "0.30", "0.40"],
-        "The stand has been moved since yx was read: read it once more only if",
+        "Another setup was read after yx. If the gauge or its stand has moved since",
     ),
-    "again of nothing": (["again"], [], "Not recorded: nothing was read yet."),
-    "again of an empty row": (["again 3"], [], "Not recorded: line 3 was not read yet."),
+    "repeat of nothing": (["repeat"], [], "Not recorded: nothing was read yet."),
+    "repeat of an empty row": (["repeat 3"], [], "Not recorded: line 3 was not read yet."),
     "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: line 2"),
     "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Line 4: yx x_min (4 of 5 missing)"),
     "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Line 4: yx x_min (4 of 5 missing)"),
-    "again of a dropped row": (
-        ["0.1", "drop 3", "again 3", "0.2"],
+    "back to a dropped row": (
+        ["0.1", "drop 3", "back 3", "0.2"],
         ["0.10", "", "", "", "", "0.20"],
-        "`again 3` adds it at the end. Line 4: yx x_min (4 of 5 missing)",
+        "`back 3` adds it again, as the last line. Line 4: yx x_min (4 of 5 missing)",
     ),
-    "again of a dropped row twice": (
-        ["drop 3", "again 3", "again 3"],
+    "back to a dropped row twice": (
+        ["drop 3", "back 3", "back 3"],
         [""] * 6,
-        "Added: line 8, yx x_max. Line 8: yx x_max (6 of 6 missing)",
+        "Not recorded: '3' is not a line; expected 2 to 8.",
     ),
-    "again of a line with the number of a dropped row": (
-        ["drop 7", "0.1", "again 2", "again 7"],
+    "repeat of a dropped row": (
+        ["0.1", "drop 2", "repeat 2"],
+        [""] * 5,
+        "Not recorded: '2' is not a line; expected 3 to 7.",
+    ),
+    "repeat of a line with the number of a dropped row": (
+        ["drop 7", "0.1", "repeat 2", "repeat 7"],
         ["0.10"],
         "Not recorded: line 7 was not read yet.",
     ),
@@ -256,7 +261,7 @@ ENTRIES = {
     "restart of nothing": (["restart 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
     "list": (["0.1", "list"], ["0.10"], "3 yx x_max: not read"),
     "show": (["show"], [], "Setup yx, 1 of 2"),
-    "help": (["help"], [], "again: read the last line once more, as another cycle"),
+    "help": (["help"], [], "repeat: read the last line once more, as another cycle"),
     "?": (["?"], [], "Ctrl-D and Ctrl-C end, too."),
     "quit": (["quit", "0.1"], [], "6 of 6 readings are missing"),
     "exit": (["exit", "0.1"], [], "6 of 6 readings are missing"),
@@ -475,13 +480,20 @@ def test_gauge_is_aligned_in_the_stated_posture(folder, run):
     assert "x_min: joints x_slide 210.250 mm" in words
 
 
+def test_alignment_posture_stays_if_its_line_is_deleted(folder, run):
+    code, out, _ = run(folder, "drop 2", "0.1")
+    assert code == 0
+    assert "session.yaml states now that yx is aligned at zero." in out
+    assert load_session(folder, partial=True).alignment_postures == {"yx": "zero", "zx": "zero"}
+
+
 def test_recording_continues_after_an_interruption(folder, run):
     run(folder, "0.1", "skip", "0.3", "0.4", "quit")
     code, out, _ = run(folder, "0.2", "0.5", "0.6", "")
     assert code == 0
     text = " ".join(out.split())
     assert "3 are recorded" in text
-    assert "This setup has readings. If the stand or the dial has moved since" in text
+    assert "This setup has readings. If the gauge or its stand has moved since" in text
     assert cells(folder) == ["0.10", "0.20", "0.30", "0.40", "0.50", "0.60"]
     assert "State in session.yaml which offsets are active in the controller" in text
     load_session(folder)
@@ -676,6 +688,42 @@ def test_side_of_approach_is_asked_for_if_the_plan_states_none(folder, run):
     assert [r["approach"] for r in rows_of(folder)][4:] == ["nnn", ""]
 
 
+def test_a_typed_side_is_corrected(folder, run):
+    """For the line that is asked for: with the reading, or by Enter alone."""
+    with_effects(folder, "backlash")
+    _, out, _ = run(folder, "p", "0.01", "back", "side n", "0.02", "0.03", "back 3", "side u", "")
+    assert "Recorded: line 2, yx zero ↓: 0.02 mm" in out
+    # without `side` a corrected reading keeps its approach
+    _, out, _ = run(folder, "n", "0.04", "side p", "back 2", "0.05", "back 4", "0.06")
+    approaches = [r["approach"] for r in rows_of(folder)]
+    assert approaches == ["nnn", "uuu", "nnn", "", "", ""]
+    assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
+    # later, and after another setup was read
+    _, out, _ = run(folder, "n", "0.07", "back 2", "side pnp", "0.05", "back 3", "side p", "")
+    assert "Noted with this reading and the next ones: approach pnp." in " ".join(out.split())
+    assert [r["approach"] for r in rows_of(folder)] == ["pnp", "ppp", "nnn", "nnn", "", ""]
+    assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
+
+
+def test_restart_deletes_typed_sides(folder, run):
+    """The same command asks for the side again."""
+    with_effects(folder, "backlash", TABLE + "yx,x_max,1,,\nyx,x_max,2,,\n")
+    run(folder, "0.01", "0.02", "0.03", "n", "0.04")
+    run(folder, "restart 2")
+    rows = rows_of(folder)
+    assert [r["approach"] for r in rows] == ["ppp", "nnn", "ppp", "ppp", "nnn", "", ""]
+    assert set(cells(folder)) == {""}
+    _, out, _ = run(folder, "0.01", "0.02", "0.03", "p", "0.04")
+    assert "From which side are the postures approached?" in out
+    assert rows_of(folder)[5]["approach"] == "ppp"
+
+
+def test_a_temperature_is_corrected_after_another_setup_was_read(folder, run):
+    with_effects(folder, "thermal")
+    run(folder, "20", "0.1", "0.2", "0.3", "30", "0.4", "back 2", "t 21", "")
+    assert [r["temperature_C"] for r in rows_of(folder)][:4] == ["21", "20", "20", "30"]
+
+
 def test_a_wrong_side_is_shown_as_it_was_typed(folder, run):
     with_effects(folder, "backlash")
     _, out, _ = run(folder, "side q", "side pq", "side ↑↓↑")
@@ -693,7 +741,7 @@ def test_a_planned_side_of_approach_stays(folder, run):
     head, *rows = file.read_text().splitlines()
     file.write_text("\n".join([f"{head},approach", *(f"{row},ppp" for row in rows), ""]))
     _, out, _ = run(folder, "side n", "0.02")
-    assert "Noted with the next readings" not in out
+    assert "Noted with" not in out
     assert "The plan states the side of this reading: ppp" in " ".join(out.split())
     assert [r["approach"] for r in rows_of(folder)] == ["ppp"] * 6
 
@@ -723,7 +771,7 @@ def test_times_are_recorded_while_the_clock_runs(folder, run):
     _, out, _ = run(folder, "clock", "0.05")
     assert rows_of(folder)[4]["time"]
     # the first setup has a reading without a time
-    _, out, _ = run(folder, "clock", "again 2", "0.06")
+    _, out, _ = run(folder, "clock", "repeat 2", "0.06")
     assert rows_of(folder)[-1]["time"] == ""
 
 

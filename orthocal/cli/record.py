@@ -15,7 +15,7 @@ from orthocal.runtime.interrupts import INTERRUPTED
 def record(session: Path) -> None:
     """Record readings one at a time, with warnings of mistakes.
 
-    The position of stand and machine is printed for each reading. Every reading is on disk before
+    The positions of gauge and machine are printed for each reading. Every reading is on disk before
     the next one is asked for. An interrupted recording continues at the first missing reading.
     From a pipe each line counts as typed.
 

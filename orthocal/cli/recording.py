@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from typing import TypeGuard
 
@@ -21,11 +22,11 @@ from orthocal.hypotheses.search import find_suspected_rows
 from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading, plain_minus
 from orthocal.kinematics.conditions import APPROACH, find_approach_problem
 from orthocal.measurement.files.readings_checks import parse_temperature
-from orthocal.measurement.recording import Recording
+from orthocal.measurement.recording import RecordedReading, Recording
 from orthocal.observation.conditions import needed_conditions
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
 from orthocal.runtime.interrupts import raised_interrupt
-from orthocal.session.session import Conditions, Reading, ReadingKey
+from orthocal.session.session import Conditions, ReadingKey
 from orthocal.text import printable, shorten
 
 USUAL_C = 5.0, 45.0
@@ -66,7 +67,7 @@ class RecordedConditions:
         self._asked: set[str] = set()
         """Setups whose temperature was asked for."""
 
-    def question(self, row: Reading) -> str | None:
+    def question(self, row: RecordedReading) -> str | None:
         """Condition to ask for before a row is read; None if all are known."""
         if row.minus is not None:
             return None
@@ -84,52 +85,48 @@ class RecordedConditions:
         if self.temperature is None and temperatures:
             self.temperature = temperatures[-1]
 
-    def answer(self, question: str, text: str, row: Reading) -> None:
-        """Store the answer to a question; an empty one accepts the proposed value.
+    def set_condition(self, condition: str, text: str, row: RecordedReading | None) -> None:
+        """Set a condition of the following readings.
+
+        Args:
+            condition: "approach" or "temperature".
+            text: The condition as typed; "" accepts the proposed value.
+            row: Row that is asked for; its setup needs no question about the temperature then.
 
         Raises:
-            SessionError: If the answer is invalid.
+            SessionError: If the text is invalid.
         """
-        if question == "approach":
-            self.set_approach(text or self.programmed)
+        if condition == "approach":
+            self._set_approach(text or self.programmed)
             return
         if text:
-            self.set_temperature(text)
-        self._asked.add(row.setup)
+            self._set_temperature(text)
+        if row is not None:
+            self._asked.add(row.setup)
 
-    def set_temperature(self, text: str) -> None:
-        """Set the temperature of the following readings, [°C].
-
-        Raises:
-            SessionError: If the temperature is not that of a workshop.
-        """
+    def _set_temperature(self, text: str) -> None:
+        """Set the temperature, [°C]; refuse one that no workshop has."""
         number = plain_minus(text).replace(",", ".")
         before, self.temperature = self.temperature, parse_temperature(number, "the temperature")
         change = abs(self.temperature - before) if _is_usual(before) else 0.0
         self.is_unusual = not _is_usual(self.temperature) or change > USUAL_CHANGE
 
-    def set_approach(self, text: str) -> None:
-        """Set the approach of the following readings: one letter for each drive, or for all.
-
-        Raises:
-            SessionError: If the letters are wrong.
-        """
+    def _set_approach(self, text: str) -> None:
+        """Set the approach: one letter for each drive, or for all."""
         robot = self._recording.session.robot
         letters = text * len(robot.drives) if text in APPROACH else text
         if problem := find_approach_problem(letters, robot):
             raise SessionError(f"the side is {problem}; or one of these letters for all drives")
         self.approach = letters
 
-    def of(self, row: Reading) -> Conditions | None:
-        """Conditions of a reading that is typed now; None if nothing is stated."""
+    def of(self, row: RecordedReading) -> Conditions:
+        """Conditions of a reading that is typed now, without a planned approach."""
         if row.minus is not None:
-            return None
-        stated = Conditions(
-            self.approach if row.approach is None else None, self.temperature, self._time(row)
-        )
-        return None if stated == Conditions() else stated
+            return Conditions()
+        approach = self.approach if row.planned_approach is None else None
+        return Conditions(approach, self.temperature, self._time(row))
 
-    def _time(self, row: Reading) -> datetime | None:
+    def _time(self, row: RecordedReading) -> datetime | None:
         """Time of the clock, with a time zone unless other readings have times without one.
 
         None if another reading of the setup has no time; then the order of the rows is assumed.
@@ -171,10 +168,12 @@ class Dialogue:
         """Setup that was described last."""
         self._last: int | None = None
         """Index of the row that was read last."""
-        self._dropped: dict[str, list[Reading]] = {}
+        self._dropped: dict[str, list[RecordedReading]] = {}
         """Deleted rows by their line."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
+        self._stated: set[str] = set()
+        """Conditions that were typed while this row is asked for."""
 
     def run(self) -> None:
         """Ask for readings until none is missing and Enter is typed, or the input ends."""
@@ -191,7 +190,7 @@ class Dialogue:
 
     def _ask_for(self, index: int | None) -> None:
         """Ask for a row; None if all are read or skipped."""
-        self._asked = index
+        self._asked, self._stated = index, set()
         self._show()
 
     def _ask_for_next(self) -> None:
@@ -227,9 +226,29 @@ class Dialogue:
 
         Another setup was read since, or the program was started anew.
         """
+        is_past = self._last is None or self._is_of_earlier_setup(index)
+        return self._recording.rows[index].is_read and is_past
+
+    def _is_of_earlier_setup(self, index: int) -> bool:
+        """True for a row after whose setup this program recorded another setup."""
+        if self._last is None:
+            return False
+        last, row = (self._text.name(self._recording.rows[i]) for i in (self._last, index))
+        return last != row
+
+    def _conditions_of(self, index: int) -> Conditions:
+        """Conditions to record with a reading that is typed now; those that are None do not change.
+
+        A reading that exists already keeps its approach, unless another one was typed for it.
+        """
         row = self._recording.rows[index]
-        last = None if self._last is None else self._recording.rows[self._last]
-        return row.is_read and (last is None or last.setup != row.setup)
+        present = self._conditions.of(row)
+        if not row.is_read:
+            return present
+        kept = {"approach"}
+        if self._keeps_conditions(index):
+            kept |= {"temperature", "time"}
+        return replace(present, **dict.fromkeys(kept - self._stated))
 
     def _show_again(self) -> None:
         self._shown = None
@@ -276,7 +295,9 @@ class Dialogue:
         word, *arguments = line.split() or [""]
         try:
             if self._question is not None and self._is_answer(word, arguments):
-                self._answer_question(self._question, word)
+                self._set_condition(self._question, word)
+                if self._question is not None:
+                    self._note(self._text.question(self._question, self._conditions.temperature))
             elif not word:
                 self._keep()
             elif word[0].isalpha() or word == "?":
@@ -299,39 +320,26 @@ class Dialogue:
             return True
         return not (word and (word[0].isalpha() or word == "?"))
 
-    def _answer_question(self, question: str, word: str) -> None:
-        """Store a condition, and ask for the next one or for the reading."""
-        row = self._recording.rows[self._require_row()]
-        self._conditions.answer(question, word, row)
-        self._note(self._text.conditions(self._conditions.of(row)))
-        self._doubt_temperature()
-        if self._question is not None:
-            self._note(self._text.question(self._question, self._conditions.temperature))
-
-    def _set_condition(self, name: str, text: str) -> None:
-        """Set a condition of the following readings."""
-        if name == "temperature":
-            self._conditions.set_temperature(text)
-        else:
-            self._conditions.set_approach(text)
-        if self._asked is not None:
-            row = self._recording.rows[self._asked]
-            if name == "temperature":  # answers the question of this setup
-                self._conditions.answer("temperature", "", row)
-            elif row.approach is not None:
-                self._note(self._text.planned_side(row.approach))
-                return
-            self._note(self._text.conditions(self._conditions.of(row)))
-            self._doubt_temperature()
-
-    def _doubt_temperature(self) -> None:
-        """Ask whether an unusual temperature is right."""
+    def _set_condition(self, condition: str, text: str) -> None:
+        """Set a condition of the reading that is asked for, and of the following ones."""
+        row = None if self._asked is None else self._recording.rows[self._asked]
+        self._conditions.set_condition(condition, text, row)
+        if self._asked is None or row is None:
+            return
+        if condition == "approach" and row.planned_approach is not None:
+            self._note(self._text.planned_side(row.planned_approach))
+            return
+        self._stated.add(condition)
+        self._note(self._text.conditions(self._conditions_of(self._asked)))
         if self._conditions.is_unusual and self._conditions.temperature is not None:
             self._note(self._text.unusual_temperature(self._conditions.temperature))
             self._conditions.is_unusual = False
 
     def _keep(self) -> None:
-        """Keep the reading of the row that is asked for; end the dialogue if no row is."""
+        """Keep the reading of the row that is asked for, with the conditions typed for it.
+
+        The dialogue ends if no row is asked for.
+        """
         if self._asked is None:
             raise _EndOfDialogue
         if not self._recording.rows[self._asked].is_read:
@@ -339,14 +347,16 @@ class Dialogue:
             reading = f"the reading of the {self._text.instrument(self._asked)}"
             expected = "x, y and z of the point" if is_point else reading
             raise SessionError(f"type {expected}, or `skip`, or `help`")
-        self._ask_for_next()
+        if self._stated:
+            self._record(self._asked, self._recording.value(self._asked))
+        else:
+            self._ask_for_next()
 
     def _record(self, index: int, value: float | Array) -> None:
         """Record a reading, compare it with its prediction, and judge the readings if necessary."""
         recording = self._recording
         corrected = recording.rows[index].is_read
-        conditions = self._conditions.of(recording.rows[index])
-        recording.read(index, value, None if self._keeps_conditions(index) else conditions)
+        recording.read(index, value, self._conditions_of(index))
         row = recording.rows[index]
         self._skipped -= {recording.rows[i].key for i in recording.point(index)}
         self._last = index
@@ -370,7 +380,7 @@ class Dialogue:
 
     def _contradicts(self, index: int) -> bool:
         """Print the prediction of a row; True if its value contradicts it."""
-        if not self._can_judge or not self._recording.is_located:
+        if not self._is_judged:
             return False
         rows = self._recording.rows
         excluded = self._rows_with_warning() - set(self._recording.point(index))
@@ -387,6 +397,12 @@ class Dialogue:
         if is_far(rows[index].value, mean, std):
             self._far.add(rows[index].key)
         return is_doubtful(session, position, mean, std)
+
+    @property
+    def _is_judged(self) -> bool:
+        """True if there are readings that can be judged."""
+        is_empty = len(self._recording.missing) == len(self._recording.rows)
+        return self._can_judge and not is_empty and self._recording.is_located
 
     def _rows_with_warning(self) -> set[int]:
         """Indices of the rows that present or hidden findings name."""
@@ -417,8 +433,7 @@ class Dialogue:
             True if there are new warnings.
         """
         recording = self._recording
-        is_empty = len(recording.missing) == len(recording.rows)
-        if not self._can_judge or is_empty or not recording.is_located:
+        if not self._is_judged:
             self._warnings = self._hidden = ()
             return False
         try:
@@ -475,42 +490,54 @@ class Dialogue:
         if len(names) != 1:
             which = f" ({' or '.join(names)}?)" if names else ""
             raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
-        name = names[0]
-        row_commands = {
-            **{"back": self._back, "again": self._again},
+        name, argument = names[0], arguments[0] if arguments else ""
+        examples = {"temperature": "21.5", "side": "p or n"}
+        actions = {
+            **{"skip": self._skip, "clock": self._switch_clock, "list": self._list},
+            **{"show": self._show_again, "help": self._help, "quit": self._quit},
+        }
+        if len(arguments) > (name not in actions):
+            raise SessionError(f"`{name}` has no argument '{shorten(arguments[-1])}'")
+        if name in actions:
+            actions[name]()
+        elif name not in examples:
+            self._row_command(name, argument)
+        elif argument:
+            self._set_condition("approach" if name == "side" else name, argument)
+        else:
+            raise SessionError(f"`{name}` needs a value, such as {examples[name]}")
+
+    def _row_command(self, name: str, line: str) -> None:
+        """Execute a command for a line; "" for the line that the command chooses.
+
+        Raises:
+            SessionError: If there is no such line, or the command cannot be executed now.
+        """
+        lines = [str(row.line) for row in self._recording.rows]
+        if name == "back" and line in self._dropped and line not in lines:
+            self._restore(line)
+            return
+        if line and line not in lines:
+            expected = f"{lines[0]} to {lines[-1]}"
+            raise SessionError(f"'{shorten(line)}' is not a line; expected {expected}")
+        commands = {
+            **{"back": self._back, "repeat": self._repeat},
             **{"drop": self._drop, "restart": self._restart},
         }
-        if name in ("temperature", "side") and len(arguments) == 1:
-            self._set_condition(name, arguments[0])
-            return
-        if arguments and (name not in row_commands or len(arguments) > 1):
-            raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
-        present = {str(r.line) for r in self._recording.rows}
-        if name == "again" and arguments and arguments[0] in self._dropped.keys() - present:
-            self._restore(arguments[0])
-        elif name in row_commands:
-            row_commands[name](self._parse_row(arguments[0]) if arguments else None)
-        elif name == "list":
-            self._say(self._text.list_rows())
-        elif name == "help":
-            self._say(self._text.list_commands())
-        elif name == "quit":
-            raise _EndOfDialogue
-        elif name in ("temperature", "side"):
-            example = "21.5" if name == "temperature" else "p or n"
-            raise SessionError(f"`{name}` needs a value, such as {example}")
-        elif name == "clock":
-            self._conditions.clock = not self._conditions.clock
-            self._note(self._text.clock(on=self._conditions.clock))
-        else:
-            {"skip": self._skip, "show": self._show_again}[name]()
+        commands[name](lines.index(line) if line else None)
 
-    def _parse_row(self, text: str) -> int:
-        """Index of a row from its line."""
-        lines = [str(row.line) for row in self._recording.rows]
-        if text in lines:
-            return lines.index(text)
-        raise SessionError(f"'{shorten(text)}' is not a line; expected {lines[0]} to {lines[-1]}")
+    def _switch_clock(self) -> None:
+        self._conditions.clock = not self._conditions.clock
+        self._note(self._text.clock(on=self._conditions.clock))
+
+    def _list(self) -> None:
+        self._say(self._text.list_rows())
+
+    def _help(self) -> None:
+        self._say(self._text.list_commands())
+
+    def _quit(self) -> None:
+        raise _EndOfDialogue
 
     def _require_row(self) -> int:
         if self._asked is None:
@@ -525,7 +552,7 @@ class Dialogue:
             raise SessionError("this is the first line")
         index = self._recording.point(index)[0]
         if rows[index].is_read:
-            self._note_moved(index, "correct only typing errors")
+            self._note_moved(index)
         self._ask_for(index)
 
     def _before(self, asked: int) -> int:
@@ -535,16 +562,12 @@ class Dialogue:
             return self._last
         return asked - 1
 
-    def _note_moved(self, index: int, advice: str) -> None:
+    def _note_moved(self, index: int) -> None:
         """Print advice about the setup of a row, if another setup was read since."""
-        setup = self._recording.rows[index].setup
-        if self._last is not None and self._recording.rows[self._last].setup != setup:
-            self._note(
-                f"The stand has been moved since {setup} was read: {advice}. To read there again, "
-                f"type `restart {self._recording.rows[index].line}`."
-            )
+        if self._is_of_earlier_setup(index) and (advice := self._text.moved(index)):
+            self._note(advice)
 
-    def _again(self, index: int | None) -> None:
+    def _repeat(self, index: int | None) -> None:
         rows = self._recording.rows
         if index is None:
             before = [i for i, r in enumerate(rows[: self._asked]) if r.is_read]
@@ -555,7 +578,7 @@ class Dialogue:
             raise SessionError("nothing was read yet")
         if not rows[index].is_read:
             raise SessionError(f"line {rows[index].line} was not read yet")
-        self._note_moved(index, "read it once more only if the stand was not moved")
+        self._note_moved(index)
         line = rows[index].line
         index = self._recording.repeat(index)
         self._note(f"Added: line {self._recording.rows[index].line}, which repeats line {line}.")
@@ -573,14 +596,16 @@ class Dialogue:
         index = self._require_row() if index is None else index
         rows = [self._recording.rows[i] for i in self._recording.point(index)]
         row, count = self._recording.rows[index], len(rows)
-        self._recording.drop(index)
+        stated = self._recording.drop(index)
         self._dropped[str(row.line)] = rows
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - count
         self._note(
             f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers. "
-            f"`again {row.line}` adds it at the end."
+            f"`back {row.line}` adds it again, as the last line."
         )
+        for setup, posture in stated.items():
+            self._note(f"session.yaml states now that {setup} is aligned at {posture}.")
         self._judge()
         self._ask_for_next()
 
@@ -595,7 +620,7 @@ class Dialogue:
         if index is None:
             index = self._last if self._asked is None else self._asked
         if index is None:
-            raise SessionError("no line is asked for; `restart 7` repeats the setup of line 7")
+            raise SessionError("no line is asked for; `restart 7` reads the setup of line 7 again")
         recording = self._recording
         setup = self._text.name(recording.rows[index])
         recording.empty(index)

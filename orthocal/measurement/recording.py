@@ -3,6 +3,9 @@
 A row keeps its line in the CSV: added rows come last, and a blank line remains where a row was
 deleted.
 
+An approach is planned, or the operator types it with the reading. The CSV has one column for both.
+The journal states which approaches were typed: they are corrected and deleted with their readings.
+
 A change is appended to a journal beside the readings.csv and synced; then the CSV is replaced. Each
 line of the journal holds the digests of the CSV before and after its change. If the process is
 killed or the power fails, the CSV contains the changes up to some line of the journal. The later
@@ -14,9 +17,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,15 +30,13 @@ from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.io.documents import Keys, Number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.point_rows import (
-    find_point,
-    locate_stations,
-)
+from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
+from orthocal.measurement.files.session_edits import add_alignment, add_readings
 from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
@@ -42,7 +44,13 @@ from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.points import Coordinate
 from orthocal.sensors.protocol import largest_reading
 from orthocal.session.points import base_name, gather_points
-from orthocal.session.session import Conditions, Reading, ReadingKey, Session
+from orthocal.session.session import (
+    Conditions,
+    Reading,
+    ReadingKey,
+    Session,
+    known_approach,
+)
 from orthocal.units import MM, to_mm
 
 FORMAT = "orthocal/recording/1"
@@ -58,7 +66,6 @@ CLOSED: dict[str, Any] = {"closed": True}
 
 DECIMALS = 9
 """Decimals of a recorded reading in mm."""
-
 
 BUSY = "these readings are being recorded by another process; one at a time"
 
@@ -78,7 +85,8 @@ class Change(Keys):
     point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
     """Readings of the three rows of a point."""
     conditions: Conditions | None = None
-    """Conditions stated with the value; those that are None do not change."""
+    """Conditions stated with the value; those that are None do not change, except that an approach
+    is planned unless it is stated."""
 
 
 class _JournalLine(Change):
@@ -87,11 +95,49 @@ class _JournalLine(Change):
     after: str
 
 
-def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedReading(Reading):
+    """Row of a recording.
+
+    Args:
+        has_typed_approach: Whether the approach was typed with the reading, and not planned.
+    """
+
+    has_typed_approach: bool = False
+
+    @property
+    def planned_approach(self) -> str | None:
+        """Approach that the plan states; None if it states none."""
+        return None if self.has_typed_approach else self.approach
+
+    @property
+    def emptied(self) -> RecordedReading:
+        """Row without its reading and all that was typed with it; only the approach is planned."""
+        planned = None if self.conditions is None else self.conditions.approach
+        conditions = Conditions(planned) if planned and not self.has_typed_approach else None
+        return replace(self, value=math.nan, conditions=conditions, has_typed_approach=False)
+
+    def with_reading(self, value: float, stated: Conditions | None) -> RecordedReading:
+        """Row with a reading, [m], and the conditions that are stated with it."""
+        old, new = self.conditions or Conditions(), stated or Conditions()
+        conditions = Conditions(
+            new.approach or old.approach,
+            old.temperature if new.temperature is None else new.temperature,
+            new.time or old.time,
+        )
+        return replace(
+            self,
+            value=value,
+            conditions=None if conditions == Conditions() else conditions,
+            has_typed_approach=new.approach is not None,
+        )
+
+
+def change_rows(rows: Sequence[RecordedReading], change: Change) -> tuple[RecordedReading, ...]:
     """Rows after a change.
 
     Raises:
-        SessionError: If a row to change does not exist, or an added row exists already.
+        SessionError: If a row to change does not exist, or a changed row equals another one.
     """
     indices = {row.key: i for i, row in enumerate(rows)}
     changed = list(rows)
@@ -106,42 +152,51 @@ def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
         if len(values) != len(selected):
             raise SessionError("the reading is missing")
         for index, value in zip(selected, values, strict=True):
-            row = rows[index]
-            conditions = _merge_conditions(row.conditions, change.conditions)
-            changed[index] = replace(row, value=value * MM, conditions=conditions)
-            if changed[index].key != row.key and changed[index].key in indices:
-                raise SessionError(f"{changed[index].label_with_cycle} exists already")
+            changed[index] = rows[index].with_reading(value * MM, change.conditions)
     elif change.done == "emptied":
         setup = base_name(keys[0][0])
-        changed = [_emptied(r) if base_name(r.setup) == setup else r for r in changed]
+        changed = [r.emptied if base_name(r.setup) == setup else r for r in changed]
     elif change.done == "dropped":
         changed = [row for i, row in enumerate(changed) if i not in selected]
     else:
-        if len(added) != len(keys) or any(key in indices for key in added):
-            raise SessionError("the added row exists already, or is not named")
+        if len(added) != len(keys):
+            raise SessionError("the added row is not named")
         line = 1 + max(r.line or 0 for r in rows)
         for setup, posture, minus, cycle, *approach in added:
             conditions = Conditions(approach[0]) if approach else None
-            new = Reading(setup, posture, minus, cycle, math.nan, conditions=conditions)
+            new = RecordedReading(setup, posture, minus, cycle, math.nan, conditions=conditions)
             changed.append(replace(new, line=line))
+    number = Counter(row.key for row in changed)
+    for row in changed:
+        if number[row.key] > 1:
+            raise SessionError(f"{row.label_with_cycle} exists already")
     return tuple(changed)
 
 
-def _merge_conditions(planned: Conditions | None, stated: Conditions | None) -> Conditions | None:
-    """Planned conditions, replaced by those that are stated."""
-    if planned is None or stated is None:
-        return planned or stated
-    return Conditions(
-        stated.approach or planned.approach,
-        planned.temperature if stated.temperature is None else stated.temperature,
-        stated.time or planned.time,
+def _recorded_rows(
+    readings: Sequence[Reading], changes: Iterable[Change]
+) -> tuple[RecordedReading, ...]:
+    """Rows of a session that is recorded.
+
+    Args:
+        readings: The readings as in the CSV.
+        changes: All changes that the journal contains and the CSV has.
+    """
+    typed: set[ReadingKey] = set()
+    for change in changes:
+        if change.done in ("read", "dropped"):
+            typed.difference_update(change.rows)
+        if change.done == "read" and change.conditions and change.conditions.approach:
+            known = known_approach(change.conditions)
+            places = [key[:4] for key in change.rows]
+            typed.update(place if known is None else (*place, known) for place in places)
+    return tuple(
+        RecordedReading(
+            *(r.setup, r.posture, r.minus, r.cycle, r.value, r.line, r.file, r.conditions),
+            has_typed_approach=r.is_read and r.key in typed,
+        )
+        for r in readings
     )
-
-
-def _emptied(row: Reading) -> Reading:
-    """Row without its reading and its measured conditions; only the approach is planned."""
-    approach = None if row.conditions is None else row.conditions.approach
-    return replace(row, value=math.nan, conditions=Conditions(approach) if approach else None)
 
 
 class Recording:
@@ -160,7 +215,7 @@ class Recording:
     def __init__(
         self,
         session: Session,
-        rows: Sequence[Reading],
+        rows: Sequence[RecordedReading],
         journal: Journal,
         *,
         digest: str,
@@ -231,6 +286,11 @@ class Recording:
         empty = [i for i in self.missing if self.rows[i].key not in skipped]
         return min(empty, key=lambda i: (setups.index(self.rows[i].setup), i), default=None)
 
+    def value(self, index: int) -> float | Array:
+        """Reading of a row, [m], or coordinates of its point in its station, shape (3,), [m]."""
+        rows = [self.rows[i] for i in self.point(index)]
+        return rows[0].value if len(rows) == 1 else point_of(rows, self.session.setups)
+
     def largest_reading(self, index: int) -> float:
         """Size that no reading of a row exceeds, [m]: twice the range of the gauge if stated."""
         setup = self.session.setups[self.rows[index].setup]
@@ -244,15 +304,16 @@ class Recording:
         Args:
             index: Index of the row.
             value: Reading, [m], or coordinates of a point in its station, shape (3,), [m].
-            conditions: Conditions of the reading; those that are None remain the planned ones.
+            conditions: Conditions of the reading; those that are None do not change.
 
         Raises:
-            SessionError: If the reading is beyond the range of the gauge, or the row cannot have
-                the conditions.
+            SessionError: If the reading is beyond the range of the gauge, if the row cannot have
+                the conditions, or if the plan states another approach.
             OutputError: If the files cannot be written.
         """
         rows = [self.rows[i] for i in self.point(index)]
         setups = [self.session.setups[row.setup] for row in rows]
+        conditions = conditions or Conditions()
         readings_mm = []
         for row, setup in zip(rows, setups, strict=True):
             along = getattr(setup.sensor, "along", None)
@@ -265,17 +326,17 @@ class Recording:
                 largest=largest_reading(setup.sensor),
                 of_setup_mm=[r.value / MM for r in self.rows if r.setup == row.setup and r.is_read],
             )
-            if conditions is not None:
-                check_conditions(
-                    conditions,
-                    self.session.robot,
-                    two_postures=row.minus is not None,
-                    where=row.label_with_cycle,
-                )
+            check_conditions(
+                conditions,
+                self.session.robot,
+                two_postures=row.minus is not None,
+                where=row.label_with_cycle,
+            )
             readings_mm.append(round(reading, DECIMALS))
+        stated = _conditions_to_state(rows[0], conditions)
         keys: list[ReadingKey] = [row.key for row in rows]
         values = {"point_mm": readings_mm} if len(rows) > 1 else {"reading_mm": readings_mm[0]}
-        self._apply(Change(done="read", rows=keys, conditions=conditions, **values))
+        self._apply(Change(done="read", rows=keys, conditions=stated, **values))
 
     def repeat(self, index: int) -> int:
         """Append a row that repeats a row in another cycle, and return its index.
@@ -292,28 +353,47 @@ class Recording:
             raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
         same_setup = [r for r in self.rows if r.setup == row.setup]
         difference = self.session.is_difference(row)
-        cycle = 1 + max(r.cycle for r in same_setup if difference or r.place == row.place)
+        cycle = 1 + max(r.cycle for r in same_setup if difference or _has_same_cycles(row, r))
         in_cycle = [r for r in same_setup if r.cycle == cycle]
         if any(self.session.is_difference(r) != difference for r in in_cycle):
             cycle = 1 + max(r.cycle for r in same_setup)
         rows = [self.rows[i] for i in self.point(index)]
-        added = [replace(_emptied(r), cycle=cycle).key for r in rows]
+        added = [replace(r.emptied, cycle=cycle).key for r in rows]
         self._apply(Change(done="added", rows=[*(r.key for r in rows), *added]))
         return len(self.rows) - len(added)
 
-    def drop(self, index: int) -> None:
-        """Delete a row, or the three rows of a point.
+    def drop(self, index: int) -> dict[str, str]:
+        """Delete a row, or the three rows of a point; alignment postures do not change.
+
+        Returns:
+            Alignment postures by setup that the session.yaml states from now on, because the
+            remaining rows imply others.
 
         Raises:
-            SessionError: If no other row remains.
+            SessionError: If no other row remains, or a posture cannot be stated.
             OutputError: If the files cannot be written.
         """
         rows = self.point(index)
         if len(self.rows) == len(rows):
             raise SessionError("it is the only row; a session has at least one")
-        self._apply(Change(done="dropped", rows=[self.rows[i].key for i in rows]))
+        change = Change(done="dropped", rows=[self.rows[i].key for i in rows])
+        stated = self._state_alignment(change_rows(self.rows, change))
+        self._apply(change)
+        return stated
 
-    def restore(self, dropped: Sequence[Reading]) -> int:
+    def _state_alignment(self, remaining: Sequence[Reading]) -> dict[str, str]:
+        """State the alignment postures in the session.yaml that the remaining rows would change."""
+        session = self.session
+        implied = replace(session, readings=tuple(remaining)).alignment_postures
+        changed = {n: p for n, p in session.alignment_postures.items() if p != implied[n]}
+        stated = {base_name(name): posture for name, posture in changed.items()}
+        if stated and session.path is not None:
+            write_file(session.path, add_alignment(session.path, stated))
+        aligned = {n: replace(session.setups[n], aligned_at=p) for n, p in changed.items()}
+        self.session = replace(session, setups={**session.setups, **aligned})
+        return stated
+
+    def restore(self, dropped: Sequence[RecordedReading]) -> int:
         """Append deleted rows without their readings, and return the index of the first.
 
         Args:
@@ -324,11 +404,11 @@ class Recording:
             OutputError: If the files cannot be written.
         """
         existing = [r.key for r in self.rows[: len(dropped)]]
-        self._apply(Change(done="added", rows=[*existing, *(_emptied(r).key for r in dropped)]))
+        self._apply(Change(done="added", rows=[*existing, *(r.emptied.key for r in dropped)]))
         return len(self.rows) - len(dropped)
 
     def empty(self, index: int) -> None:
-        """Delete all readings of a row's setup, to be read again; the journal preserves them.
+        """Delete all readings of a row's setup, with all that was typed; the journal has them.
 
         Raises:
             OutputError: If the files cannot be written.
@@ -357,6 +437,38 @@ class Recording:
             self.rows, self._digest = rows, digest
 
 
+def _conditions_to_state(row: RecordedReading, conditions: Conditions) -> Conditions | None:
+    """Conditions to state with a reading: an approach always unless it is planned.
+
+    Args:
+        row: Row of the reading, or the first row of a point.
+        conditions: Conditions of the reading; those that are None do not change.
+
+    Raises:
+        SessionError: If the plan states another approach.
+    """
+    approach = None
+    if row.planned_approach is None:
+        typed = row.conditions.approach if row.conditions and row.has_typed_approach else None
+        approach = conditions.approach or typed
+    elif conditions.approach not in (None, row.planned_approach):
+        raise SessionError(
+            f"the plan states the approach {row.planned_approach}; expected no other one",
+            where=row.label_with_cycle,
+        )
+    stated = replace(conditions, approach=approach)
+    return None if stated == Conditions() else stated
+
+
+def _has_same_cycles(row: RecordedReading, other: RecordedReading) -> bool:
+    """True if the cycles of another row and of repetitions of a row are counted together.
+
+    Both belong to the same postures. The approach of the repetitions may be typed later.
+    """
+    same_side = row.planned_approach in (None, other.approach)
+    return (row.posture, row.minus) == (other.posture, other.minus) and same_side
+
+
 @contextmanager
 def open_recording(path: str | Path) -> Iterator[Recording]:
     """Open a session for recording; a plan without a readings.csv gets one.
@@ -378,16 +490,17 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
-        lines = _read_lines(journal)
+        closed, lines = _read_lines(journal)
         if _is_outdated(session):  # another process may have written before the lock
             session = load_plan(path, wrong=wrong)
         for file, content in _files_to_add(session).items():
             write_file(file, content)
         if session.readings_path is None:
             session = load_plan(path, wrong=wrong)
-        rows = session.readings
         table = read_file(csv, error=SessionError)
         pending, edited = _find_pending(lines, _digest(table))
+        present = [change for _, change in lines[: len(lines) - len(pending)]]
+        rows = _recorded_rows(session.readings, [*closed, *present])
         for where, change in pending:
             try:
                 rows = change_rows(rows, change)
@@ -413,42 +526,21 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
 
 
 def _files_to_add(session: Session) -> dict[Path, bytes]:
-    """Files that turn a plan into a session: readings.csv, then session.yaml, which names it."""
-    if session.readings_path is not None or session.path is None:
-        return {}
-    csv, table = _csv_of(session), _table(session.readings, session)
-    return {csv: table, session.path: _yaml_with_readings(session.path, csv, table)}
-
-
-def _yaml_with_readings(file: Path, csv: Path, table: bytes) -> bytes:
-    """Content of a session.yaml with the key `readings` appended, otherwise unchanged.
-
-    Args:
-        file: The session.yaml, without readings.
-        csv: Path of the new readings.csv beside it.
-        table: Content of the readings.csv.
+    """Files that turn a plan into a session: readings.csv, then session.yaml, which names it.
 
     Raises:
-        SessionError: If the readings.csv exists with other rows, or the key cannot be appended.
+        SessionError: If the readings.csv has other rows, or the session.yaml cannot name it.
     """
+    if session.readings_path is not None or session.path is None:
+        return {}
+    file, csv, table = session.path, _csv_of(session), _table(session.readings, session)
     if exists(csv) and read_file(csv, error=SessionError) != table:
         raise SessionError(
             f"holds other rows than {file.name} plans and would be overwritten; move it away, or "
             f"add `readings: {csv.name}` to {file.name}",
             where=str(csv),
         )
-    content = read_file(file, error=SessionError)
-    extended = content.rstrip() + f"\nreadings: {csv.name}\n".encode()
-    expected = read_yaml(file, error=SessionError, content=content) | {"readings": csv.name}
-    try:
-        document = read_yaml(file, error=SessionError, content=extended)
-    except SessionError:
-        document = None
-    if document != expected:
-        raise SessionError(
-            f"is missing; add `readings: {csv.name}` to it", where=f"{file}: readings"
-        )
-    return extended
+    return {csv: table, file: add_readings(file, csv.name)}
 
 
 def _is_outdated(session: Session) -> bool:
@@ -489,8 +581,12 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _read_lines(journal: Journal) -> list[tuple[str, _JournalLine]]:
-    """Changes since a recording ended regularly; a new journal gets its header."""
+def _read_lines(journal: Journal) -> tuple[list[_JournalLine], list[tuple[str, _JournalLine]]]:
+    """Changes of the recordings that ended regularly, and later ones with their places.
+
+    A new journal gets its header.
+    """
+    closed: list[_JournalLine] = []
     lines: list[tuple[str, _JournalLine]] = []
     has_header = False
     for where, data in journal.entries():
@@ -501,6 +597,7 @@ def _read_lines(journal: Journal) -> list[tuple[str, _JournalLine]]:
                 where=str(journal.path),
             )
         if data == CLOSED:
+            closed += [line for _, line in lines]
             lines.clear()
         elif has_header:
             try:
@@ -515,7 +612,7 @@ def _read_lines(journal: Journal) -> list[tuple[str, _JournalLine]]:
         has_header = True
     if not has_header:
         journal.append({"format": FORMAT})
-    return lines
+    return closed, lines
 
 
 def _find_pending(

@@ -546,7 +546,7 @@ def test_a_wrong_reading_is_not_read_again_after_other_offsets_were_entered(plan
     for offsets, again in ((plan, True), (entered, False)):
         second = simulate_session(offsets, TRUTH, seed=2).session
         action = check_session(join_sessions([read, second])).decision.action
-        assert (f"type `again {line}`" in action) == again
+        assert (f"type `repeat {line}`" in action) == again
         assert ("Do not read it again" in action) != again
         assert f"`drop {line}` deletes it" in action
 

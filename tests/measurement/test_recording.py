@@ -250,6 +250,62 @@ def test_after_a_power_cut_several_changes_are_done_again(plan, monkeypatch):
     assert (plan / "readings.csv").read_bytes() == new
 
 
+BLOCKS = """# aligned by hand
+robot: orthoglide
+gauge: {sigma_mm: 0.005, tip: {ball: {radius_mm: 1.5}}}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  a-b: {tcp_mm: [-10, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+setups:  # two forms
+  yx:  # with a comment
+    leg: x
+    touches: a  # the upper one
+    direction: y
+    section: {fraction: 0.5}
+    postures: [zero, x_min]
+  zx: {leg: x, touches: a, direction: z, section: {fraction: 0.5}, postures: [a-b, x_min],}
+"""
+
+
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+def test_deleted_rows_change_no_alignment_posture(tmp_path, line_end):
+    """The posture is stated in the session.yaml as soon as the rows imply another one."""
+    file = tmp_path / "session.yaml"
+    text = BLOCKS.replace("\n", line_end)
+    file.write_bytes(text.encode())
+    with open_recording(tmp_path) as r:
+        named = file.read_bytes().decode()
+        assert r.drop(3) == {}
+        assert file.read_bytes().decode() == named
+        assert r.session.alignment_postures == {"yx": "zero", "zx": "a-b"}
+        assert r.drop(2) == {"zx": "a-b"}
+        assert r.drop(0) == {"yx": "zero"}
+        r.read(0, 0.1 * MM)
+        assert r.measured().alignment_postures == {"yx": "zero", "zx": "a-b"}
+    session = load_session(tmp_path)
+    assert [(x.setup, x.posture) for x in session.readings] == [("yx", "x_min")]
+    assert session.alignment_postures == {"yx": "zero", "zx": "a-b"}
+    expected = named.replace("    leg", "    aligned_at: zero\n    leg")
+    assert file.read_bytes().decode() == expected.replace("zx: {", "zx: {aligned_at: a-b, ")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("    leg: x", "    ? leg\n    : x"), ("  yx:", "  y:"), ("setups", "setup")]
+)
+def test_a_row_is_kept_if_its_alignment_posture_cannot_be_stated(tmp_path, old, new):
+    """The session.yaml has an unusual form, or was edited meanwhile."""
+    file = tmp_path / "session.yaml"
+    file.write_text(BLOCKS)
+    with open_recording(tmp_path) as r:
+        file.write_text(file.read_text().replace(old, new, 1))
+        before = file.read_text()
+        with pytest.raises(SessionError, match=r"setups\.yx: .* add `aligned_at: zero`"):
+            r.drop(0)
+        assert len(r.rows) == 4
+    assert file.read_text() == before
+
+
 def test_a_table_edited_by_hand_counts(plan, monkeypatch):
     with open_recording(plan) as r:
         blank = (plan / "readings.csv").read_bytes()
@@ -369,7 +425,7 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
         for value in rng.integers(-400, 400, size=1500):
             text.append(f"{value / 100:.2f}")
             if value % 7 == 0:
-                text += ["again", f"{value / 100 + 0.01:.2f}"]
+                text += ["repeat", f"{value / 100 + 0.01:.2f}"]
             if value % 11 == 0:
                 text += ["back", f"{value / 100 - 0.01:.2f}"]
         os.write(lines_in, ("\n".join(text) + "\n").encode()[:60_000])

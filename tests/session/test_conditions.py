@@ -219,10 +219,57 @@ def test_a_recording_keeps_planned_and_adds_stated_conditions(tmp_path):
         "yx,zero,2,,nnn,,",
     ]
     with open_recording(folder) as recording:
-        recording.empty(0)  # planned conditions are kept
+        recording.empty(0)  # planned approaches are kept
     assert rows_of(folder) == [
-        *("yx,zero,1,,ppp", "yx,zero,1,,nnn", "yx,x_max,1,,pnu", "yx,zero,2,,nnn")
+        *("yx,zero,1,,ppp", "yx,zero,1,,nnn", "yx,x_max,1,,", "yx,zero,2,,nnn")
     ]
+
+
+def test_a_typed_approach_is_corrected_and_deleted_with_its_reading(tmp_path):
+    """Also in later recordings; a planned approach stays."""
+    folder = write(tmp_path / "first", PLANNED)
+    with open_recording(folder) as recording:
+        recording.read(0, 0.01 * MM)
+        recording.read(2, 0.03 * MM, Conditions("pnu"))
+        recording.read(2, 0.04 * MM)
+    assert rows_of(folder)[2] == "yx,x_max,0.04,pnu,21.5"
+    with open_recording(folder) as recording:
+        assert [row.planned_approach for row in recording.rows] == ["ppp", "nnn", None]
+        recording.read(2, 0.04 * MM, Conditions("uuu"))
+    with open_recording(folder) as recording:
+        recording.read(2, 0.05 * MM, Conditions("nnp", temperature=22.0))
+        repeated = recording.repeat(2)
+        assert recording.rows[repeated].key == ("yx", "x_max", None, 2)
+        recording.drop(repeated)
+    assert rows_of(folder) == ["yx,zero,0.01,ppp,", "yx,zero,,nnn,", "yx,x_max,0.05,nnp,22"]
+    with open_recording(folder) as recording:
+        recording.empty(2)
+        assert [row.approach for row in recording.rows] == ["ppp", "nnn", None]
+
+
+def test_an_approach_that_the_table_states_is_planned(tmp_path):
+    """Even if such a row was read in the journal of a plan that stated no approach."""
+    folder = write(tmp_path / "first", PLANNED)
+    with open_recording(folder) as recording:
+        recording.read(2, 0.03 * MM, Conditions("pnu"))
+    (folder / "readings.csv").write_text(PLANNED.replace("x_max,,", "x_max,,pnu"))
+    for _ in range(2):
+        with open_recording(folder) as recording:
+            assert recording.rows[2].planned_approach == "pnu"
+            recording.read(2, 0.03 * MM)
+    with open_recording(folder) as recording:
+        recording.empty(2)
+        assert recording.rows[2].approach == "pnu"
+
+
+def test_an_approach_is_not_typed_if_two_rows_became_the_same(tmp_path):
+    folder = write(tmp_path / "first", PLANNED + "yx,zero,,,\n")
+    with open_recording(folder) as recording:
+        with pytest.raises(SessionError, match="exists already"):
+            recording.read(3, 0.0, Conditions("nnn"))
+        recording.read(3, 0.0, Conditions("pnp"))
+        repeated = recording.repeat(3)
+        assert recording.rows[repeated].key == ("yx", "zero", None, 2)
 
 
 def test_the_journal_restores_conditions(tmp_path):
@@ -230,13 +277,15 @@ def test_the_journal_restores_conditions(tmp_path):
     with open_recording(folder) as recording:
         before = (folder / "readings.csv").read_bytes()
         recording.read(1, 0.02 * MM, Conditions(temperature=20.5))
+        recording.read(2, 0.02 * MM, Conditions("pnp"))
         after = (folder / "readings.csv").read_bytes()
         journal = (folder / f"readings.csv{SUFFIX}").read_bytes()
     (folder / "readings.csv").write_bytes(before)
     (folder / f"readings.csv{SUFFIX}").write_bytes(journal)  # not closed
-    assert json.loads(journal.splitlines()[-1])["conditions"] == {"temperature_C": 20.5}
+    assert json.loads(journal.splitlines()[-2])["conditions"] == {"temperature_C": 20.5}
     with open_recording(folder) as recording:
-        assert recording.restored == 1
+        assert recording.restored == 2
+        assert [row.planned_approach for row in recording.rows] == ["ppp", "nnn", None]
     assert (folder / "readings.csv").read_bytes() == after
 
 
@@ -246,9 +295,11 @@ def test_a_recording_refuses_impossible_conditions(tmp_path):
         for wrong in (Conditions("pp"), Conditions(temperature=300.0)):
             with pytest.raises(SessionError, match="expected"):
                 recording.read(0, 0.0, wrong)
-        with pytest.raises(SessionError, match="exists already"):
+        with pytest.raises(SessionError, match="the plan states the approach ppp"):
             recording.read(0, 0.0, Conditions("nnn"))
         assert recording.missing == (0, 1, 2)
+        recording.read(0, 0.0, Conditions("ppp"))
+        assert recording.rows[0].planned_approach == "ppp"
     with pytest.raises(ValueError, match="approach"):
         Change.model_validate(
             {"done": "read", "rows": [["yx", "zero", None, 1]], "conditions": {"approach": "x"}}

@@ -726,7 +726,7 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
             f" If the gauge has been moved since, type `restart {line}`: it reads the setup again."
         )
     return (
-        f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}.{moved} "
+        f"Read {what} again: in `orthocal record {path}` type `repeat {line}`{others}.{moved} "
         f"{correct}"
     )
 

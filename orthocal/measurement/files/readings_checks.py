@@ -310,7 +310,7 @@ def check_conditions(
     Raises:
         SessionError: If the reading cannot have the conditions.
     """
-    if two_postures:
+    if two_postures and conditions != Conditions():
         raise SessionError(
             "has two postures; conditions belong to readings in one posture", where=where
         )

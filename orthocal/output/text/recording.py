@@ -9,10 +9,11 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
-from orthocal.measurement.files.point_rows import point_of
 from orthocal.measurement.motion.approach import (
     approach_length,
     common_approach,
@@ -42,14 +43,14 @@ GLUE = "\u00a0"
 """Space at which no line ends."""
 
 COMMANDS = {
-    "back": "correct the reading before; `back 7` line 7",
-    "again": "read the last line once more, as another cycle; `again 7` line 7",
+    "back": "correct the reading before; `back 7` line 7, also after `drop 7`",
+    "repeat": "read the last line once more, as another cycle; `repeat 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
-    "restart": "delete the readings of this setup and read it again, if the gauge has moved; "
+    "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
     "`restart 7` the setup of line 7",
-    "temperature": "temperature of the following readings in °C, such as `t 22.5`",
-    "side": "side of approach of the following readings where the plan states none: `side n`",
+    "temperature": "temperature in °C of this reading and the next ones, such as `t 22.5`",
+    "side": "approach of this reading and the next ones, unless the plan states it: `side n`",
     "clock": "begin or stop to note the time of each reading; stop if you type from paper",
     "list": "all lines and their readings",
     "show": "this setup and posture once more",
@@ -94,27 +95,27 @@ class RecordingText:
             f"Enter: {programmed} ({arrow}), as the programs do. `side n` changes it later."
         )
 
-    def conditions(self, conditions: Conditions | None) -> str:
-        """Conditions that are noted with the next readings."""
+    def conditions(self, conditions: Conditions) -> str:
+        """Conditions that are noted with the reading that is asked for, and with the next ones."""
         noted = []
-        if conditions is not None and conditions.approach is not None:
+        if conditions.approach is not None:
             noted.append(f"approach {conditions.approach}")
-        if conditions is not None and conditions.temperature is not None:
+        if conditions.temperature is not None:
             noted.append(f"{conditions.temperature:g} °C")
-        return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
+        return f"Noted with this reading and the next ones: {', '.join(noted) or 'no temperature'}."
 
     def unusual_temperature(self, temperature: float) -> str:
         """Question whether a temperature, [°C], is right."""
         return f"Is {temperature:g} °C the temperature of the machine? Otherwise type it: `t 20`."
 
     def planned_side(self, approach: str) -> str:
-        """The plan states the side of a reading, so that it cannot be set."""
+        """Refusal of a side for a reading whose approach the plan states."""
         return (
             f"The plan states the side of this reading: {approach}. `side` changes no such reading."
         )
 
     def clock(self, *, on: bool) -> str:
-        """True if the time of each reading is noted."""
+        """Answer to the command that begins or stops noting the times of readings."""
         if on:
             return "The time of each reading is noted."
         return "The time is not noted; lines count as read in their order, a minute apart."
@@ -189,6 +190,21 @@ class RecordingText:
         """Noun for what shows the reading of a row."""
         return instrument(self._session.setups[self._recording.rows[index].setup].sensor)
 
+    def moved(self, index: int) -> str:
+        """Advice for a row of a setup after which another setup was read.
+
+        Empty if the setup has no gauge that stays in its place.
+        """
+        row = self._recording.rows[index]
+        setup, name = self._session.setups[row.setup], self.name(row)
+        if reads_pairs(setup.sensor):
+            return ""
+        return (
+            f"Another setup was read after {name}. If the {_name_gauge(setup, stand=True)} has "
+            f"moved since, correct typing errors only, or type `restart {row.line}` to read {name} "
+            "again."
+        )
+
     def setup(self, name: str) -> str:
         """Position of the gauge of a setup, and preparation of its dial."""
         session, rows = self._session, self._recording.rows
@@ -203,19 +219,18 @@ class RecordingText:
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
         parts = [f"Place: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
-        noun = instrument(setup.sensor)
-        gauge = "stand or the dial" if noun == "dial" else noun
+        gauge, gauge_or_stand = _name_gauge(setup), _name_gauge(setup, stand=True)
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
-                f"This setup has readings. If the {gauge} has moved since, `restart` the setup."
+                f"This setup has readings. If the {gauge_or_stand} has moved since, `restart` the "
+                "setup."
             )
         elif isinstance(setup.sensor, Points):
             parts.append("From then on do not touch the instrument until the setup is complete.")
         elif not reads_pairs(setup.sensor):
             parts.append(
-                f"Go to {aligned} and align the {'gauge' if noun == 'dial' else noun}. {go}"
-                f"{set_dial(session, setup.name)} From then on do not touch the {gauge} until the "
-                "setup is complete."
+                f"Go to {aligned} and align the {gauge}. {go}{set_dial(session, name)} From then "
+                f"on do not touch the {gauge_or_stand} until the setup is complete."
             )
         if all(map(session.is_difference, of_setup)):
             parts.append(
@@ -257,10 +272,8 @@ class RecordingText:
 
     def value(self, index: int) -> str:
         """Reading of a row, or the coordinates of its point, in mm."""
-        part = [self._recording.rows[i] for i in self._recording.point(index)]
-        if len(part) == 1:
-            return show_mm(part[0].value)
-        return ", ".join(show_mm(v) for v in point_of(part, self._session.setups).tolist())
+        values = np.atleast_1d(self._recording.value(index))
+        return ", ".join(show_mm(v) for v in values.tolist())
 
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
@@ -455,6 +468,12 @@ class RecordingText:
 def show_mm(value: float) -> str:
     """A reading in mm with all its decimals, two at least."""
     return trim_zeros(f"{to_mm(value) + 0.0:.6f}")
+
+
+def _name_gauge(setup: Setup, *, stand: bool = False) -> str:
+    """Noun for the gauge of a setup; also for the stand of an indicator on request."""
+    noun = instrument(setup.sensor)
+    return f"gauge{' or its stand' * stand}" if noun == "dial" else noun
 
 
 def _gauge(session: Session, setup: Setup) -> str:
