@@ -23,19 +23,20 @@ endef
 
 unexport PYTHONDONTWRITEBYTECODE  # processes of tests do not compile what others have compiled
 
-.PHONY: calibrate test suite benchmarks smoke check docs clean
+.PHONY: calibrate test compiled suite benchmarks smoke check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED)
 	@# two processes at first: a benchmark compares times
-	$(MAKE) --jobs 2 --output-sync check benchmarks
+	$(MAKE) --jobs 2 --output-sync check benchmarks compiled
 	$(MAKE) suite
 
-suite: $(TESTED)
-	@# compiles the tests for all workers
+compiled: $(TESTED)  # the tests, once for all workers
 	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
+
+suite: $(TESTED)
 	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
 	  --ignore tests/benchmarks
 
