@@ -19,7 +19,7 @@ from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import SMALLEST_SIGMA
-from orthocal.statistics.information import assume_others_known, decompose
+from orthocal.statistics.information import decompose
 from orthocal.statistics.noise import Noise
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
@@ -65,11 +65,6 @@ class ModelResult:
 
     model: str
     n_free: int
-    rank: int
-    """Number of combinations of its parameters that readings without noise would determine."""
-    redundancy: int
-    """Independent readings minus the rank: number of checks of the model. Repeated readings count
-    once."""
     effective: float
     """Effective number of parameters."""
     prior: bool
@@ -83,6 +78,16 @@ class ModelResult:
     """Tool errors; None for a robot without a tool centre point."""
     linearisation_cost: ErrorStatistics | None
     """Difference of the tool position between both estimates after alignment."""
+
+    @property
+    def rank(self) -> int:
+        """See `Calibration.rank`."""
+        return self.calibration.rank
+
+    @property
+    def redundancy(self) -> float:
+        """See `Calibration.redundancy`."""
+        return self.calibration.redundancy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,15 +121,12 @@ def score_model(
     """
     fit = fit_problem(problem, options=options)
     linearisation = fit.linearisation
-    rank = assume_others_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
     tool = _assess_tool(calibration)
     effective = _effective_parameters(fit)
     return ModelResult(
         model=problem.selection.label,
         n_free=problem.n_machine,
-        rank=rank,
-        redundancy=fit.independent_readings - rank,
         effective=effective,
         prior=bool(problem.machine_selection.prior.any()),
         by_choice=by_choice,

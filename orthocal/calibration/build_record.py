@@ -48,7 +48,7 @@ from orthocal.statistics.identifiability import (
     Identifiability,
     analyse_identifiability,
 )
-from orthocal.statistics.information import marginalise
+from orthocal.statistics.information import count_others, marginalise
 from orthocal.statistics.zeros import project_out_zeros
 
 
@@ -173,13 +173,15 @@ def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Ident
     """Identifiability of the free parameters, or of all if base parameters were estimated."""
 
     def analyse(linearisation: LinearProblem) -> Identifiability:
-        machine = linearisation.problem.machine_selection.parameters
+        machine, information = linearisation.problem.machine_selection, linearisation.information
+        n = len(machine.parameters)
         return analyse_identifiability(
-            marginalise(linearisation.information, len(machine), sigma=fit.sigma),
-            machine,
+            marginalise(information, n, sigma=fit.sigma),
+            machine.parameters,
             sigma=fit.noise.sigma,
             n_postures=len(fit.problem.session.postures),
             n_readings=fit.independent_readings,
+            n_nuisance=count_others(information, n, sigma=fit.sigma),
         )
 
     solved = analyse(fit.linearisation)
@@ -189,7 +191,10 @@ def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Ident
         linearise_problem(full_problem.with_noise_ratio(fit.problem.noise_ratio))
     )
     return replace(
-        combinations, singular_values=solved.singular_values, rank=solved.structural_rank
+        combinations,
+        singular_values=solved.singular_values,
+        rank=solved.structural_rank,
+        n_nuisance=solved.n_nuisance,
     )
 
 

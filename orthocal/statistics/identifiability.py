@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from orthocal.arrays import Array
 from orthocal.io.documents import Count, Number
-from orthocal.io.fields import CLOSED, Many, Vector, read_only
+from orthocal.io.fields import CLOSED, Many, Size, Vector, read_only
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
@@ -94,6 +94,9 @@ class Identifiability:
     n_postures: Annotated[Count, Field(ge=1)]
     n_readings: Count
     """Independent readings: readings minus repetitions and gauge zeros."""
+    n_nuisance: Size
+    """Effective number of nuisance parameters, with their priors: independent readings that
+    determine them instead of errors of the machine."""
     below_noise: Many[str]
     """Parameters that change the readings by less than the threshold."""
     resolvable: Many[str]
@@ -137,6 +140,7 @@ def analyse_identifiability(
     sigma: float,
     n_postures: int,
     n_readings: int,
+    n_nuisance: float = 0.0,
 ) -> Identifiability:
     """Analyse an identification Jacobian.
 
@@ -147,6 +151,7 @@ def analyse_identifiability(
             without noise.
         n_postures: Postures of the session.
         n_readings: Independent readings of the session.
+        n_nuisance: Effective number of nuisance parameters.
     """
     factor, s = information.factor, information.singular_values
     smallest = RANK_THRESHOLD * float(s[0])
@@ -161,6 +166,7 @@ def analyse_identifiability(
         structural_rank=information.rank,
         n_postures=n_postures,
         n_readings=n_readings,
+        n_nuisance=n_nuisance,
         below_noise=tuple(n for n, size in zip(names, norms, strict=True) if size <= threshold),
         resolvable=tuple(n for n, ok in zip(names, resolvable, strict=True) if ok),
         alike=_find_alike(factor, parameters, threshold),
