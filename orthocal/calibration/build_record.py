@@ -48,7 +48,7 @@ from orthocal.statistics.identifiability import (
     Identifiability,
     analyse_identifiability,
 )
-from orthocal.statistics.information import count_others, marginalise
+from orthocal.statistics.information import Information, count_others, marginalise
 from orthocal.statistics.zeros import project_out_zeros
 
 
@@ -170,18 +170,23 @@ def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
 
 
 def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Identifiability:
-    """Identifiability of the free parameters, or of all if base parameters were estimated."""
+    """Identifiability of the free parameters, or of all if base parameters were estimated.
+
+    Its unit is metres of the gauge with the least noise, whichever gauge is the first.
+    """
+    finest = float(fit.problem.noise_ratio.min())
 
     def analyse(linearisation: LinearProblem) -> Identifiability:
-        machine, information = linearisation.problem.machine_selection, linearisation.information
+        machine, sigma = linearisation.problem.machine_selection, finest * fit.sigma
+        information = Information(finest * linearisation.information.factor)
         n = len(machine.parameters)
         return analyse_identifiability(
-            marginalise(information, n, sigma=fit.sigma),
+            marginalise(information, n, sigma=sigma),
             machine.parameters,
-            sigma=fit.noise.sigma,
+            sigma=finest * fit.noise.sigma,
             n_postures=len(fit.problem.session.postures),
             n_readings=fit.independent_readings,
-            n_nuisance=count_others(information, n, sigma=fit.sigma),
+            n_nuisance=count_others(information, n, sigma=sigma),
         )
 
     solved = analyse(fit.linearisation)

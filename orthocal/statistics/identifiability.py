@@ -83,10 +83,11 @@ class Identifiability:
     __pydantic_config__ = CLOSED
 
     singular_values: Vector
-    """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m per
-    prior std]. If base parameters were estimated, of their columns."""
+    """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m of
+    the gauge with the least noise per prior std]. If base parameters were estimated, of their
+    columns."""
     threshold: Number
-    """Smallest singular value of a resolvable direction, [m per prior std]."""
+    """Smallest singular value of a resolvable direction, in the unit of the singular values."""
     rank: Count
     """Number of singular values above the threshold."""
     structural_rank: Count
@@ -114,12 +115,13 @@ class Identifiability:
 
     @property
     def observability(self) -> dict[str, float]:
-        """Observability indices O1 to O5 of the resolvable directions, [m per prior std].
+        """Observability indices O1 to O5 of the resolvable directions.
 
         O1 = (∏ s)^(1/r)/√postures (Borm and Menq 1991), O2 = s_r/s_1 (Driels and Pathre 1990, [1]),
         O3 = s_r and O4 = s_r²/s_1 (Nahvi and Hollerbach 1994, 1996), O5 = 1/Σ 1/s (Sun and
-        Hollerbach 2008). All are 0 without resolvable directions. The indices do not compare plans
-        with different numbers r of resolvable directions.
+        Hollerbach 2008). O2 is a number; the others have the unit of the singular values. All are 0
+        without resolvable directions. The indices do not compare plans with different numbers r of
+        resolvable directions.
         """
         s = self.singular_values[: self.rank]
         if not self.rank:
@@ -219,7 +221,9 @@ def _find_alike(
     """Groups of parameters whose columns are multiples of each other within the threshold."""
     norms = np.linalg.norm(factor, axis=0)
     products = factor.T @ factor
-    pending = [int(i) for i in np.argsort(-norms, kind="stable") if norms[i] > threshold]
+    # rounding errors must not decide between equal norms
+    order = np.argsort(-np.round(norms / (norms.max(initial=0.0) or 1.0), 9), kind="stable")
+    pending = [int(i) for i in order if norms[i] > threshold]
     groups = []
     while pending:
         lead, *others = pending
