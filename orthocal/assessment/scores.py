@@ -44,8 +44,10 @@ class Score:
     aicc: float
     """m + 2 k + 2 k (k + 1)/(n − k − 1); infinite if n − k − 1 is not positive.
 
-    m = n ln(Σ (r/w)²/n) + Σ ln w² over independent readings, with the estimated noise w of their
-    gauge relative to that of the first gauge."""
+    m = n ln(Σ (r/w)²/n) + Σ ln w² over independent readings, with the noise w of their gauge
+    relative to that of the first gauge. k is the effective number of parameters, plus 1 for the
+    noise that m eliminates, plus the number of ratios w that are estimated. Stated ratios are known
+    and do not count; gauges with few readings share one estimate."""
     bic: float
     """m + k ln n; infinite without degrees of freedom."""
     prediction_error: Array
@@ -179,7 +181,7 @@ def _score(
     sum_of_squares = float(residual @ residual)
     errors = residual * problem.noise_ratio
     rows = observations.rows(errors)
-    k = effective + 1.0  # with the noise
+    k = effective + 1.0 + fit.noises.estimated_ratios
     denominator = count - k - 1.0
     # without any scatter all models fit equally well
     mean_square = max(sum_of_squares / count, SMALLEST_SIGMA**2)

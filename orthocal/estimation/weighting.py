@@ -164,6 +164,8 @@ class NoiseEstimate:
     """Noise of the first gauge, with the degrees of freedom and residuals of all gauges."""
     ratio: Array
     """Noise of each entry relative to the first gauge, shape (n_entries,)."""
+    estimated_ratios: int = 0
+    """Number of ratios between gauges that are estimated from the readings, not stated."""
 
     def with_sigmas(self, groups: Sequence[GaugeReadings], sigmas: Array) -> NoiseEstimate:
         """The estimate with standard deviations of the entries, shape (n_entries,), [m].
@@ -171,10 +173,11 @@ class NoiseEstimate:
         An unknown noise remains unknown.
         """
         firsts = [float(sigmas[g.entries][0]) for g in groups]
-        return NoiseEstimate(
-            tuple(n.with_sigma(s) for n, s in zip(self.gauges, firsts, strict=True)),
-            self.common.with_sigma(firsts[0]),
-            sigmas / firsts[0],
+        return replace(
+            self,
+            gauges=tuple(n.with_sigma(s) for n, s in zip(self.gauges, firsts, strict=True)),
+            common=self.common.with_sigma(firsts[0]),
+            ratio=sigmas / firsts[0],
         )
 
 
@@ -221,7 +224,8 @@ class Scatter:
         first = float(sigmas[self.groups[0].entries][0])
         pooled = self.pool(self.groups, sigmas).scaled(first)
         common = combine_noises(noises, pooled, sigma=first)
-        return NoiseEstimate(tuple(noises), common, sigmas / first)
+        ratios = _count_estimated_ratios(noises, few)
+        return NoiseEstimate(tuple(noises), common, sigmas / first, ratios)
 
     def common(self) -> Noise:
         """Noise of the first gauge, with the present ratios of the gauges."""
@@ -264,6 +268,20 @@ class Scatter:
 def _is_determined(noise: Noise) -> bool:
     """True if there are enough readings for the noise of one of several gauges."""
     return max(noise.cycles_dof, noise.residual_dof) >= MIN_DOF
+
+
+def _count_estimated_ratios(noises: Sequence[Noise], few: Sequence[int]) -> int:
+    """Number of noise ratios of several gauges that their readings determine.
+
+    Gauges with a stated or unknown noise have known ratios to each other.
+
+    Args:
+        noises: Noise of each gauge.
+        few: Indices of the gauges that share one factor.
+    """
+    is_estimated = [n.source in ("cycles", "residuals") for n in noises]
+    estimates = {-1 if i in few else i for i, estimated in enumerate(is_estimated) if estimated}
+    return len(estimates) - all(is_estimated)
 
 
 def _root_mean_square(values: Array) -> float:
