@@ -20,13 +20,12 @@ from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA, noise_floor
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, split_label
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 STANDSTILL = 1e-6

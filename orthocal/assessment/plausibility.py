@@ -18,10 +18,10 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.hypotheses.families.unit_and_sign import decimal_steps
 from orthocal.measurement.joining import split_sessions
+from orthocal.observation.gauge_noise import noise_floor
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import INCH, MM
 

@@ -14,11 +14,11 @@ from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, command_to_restart, place_of
 from orthocal.calibration.assessment_record import Finding
-from orthocal.estimation.weighting import ROUNDING_ERROR, stated_sigma, usual_difference
 from orthocal.hypotheses.hypothesis import Rows, group_rows
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.motion.approach import label_reading
+from orthocal.observation.gauge_noise import ROUNDING_ERROR, stated_sigma, usual_difference
 from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 from orthocal.units import MM

@@ -18,7 +18,7 @@ from orthocal.estimation.fit import Fit, fit_problem, require_determined
 from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA
 from orthocal.statistics.information import decompose
 from orthocal.statistics.noise import Noise
 from orthocal.statistics.zeros import project_out_zeros, zero_shares

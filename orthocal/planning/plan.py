@@ -17,9 +17,9 @@ from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.motion.approach import usual_approaches
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.candidates import (
     MIN_READINGS,
     Candidates,

@@ -26,8 +26,8 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
 from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.weighting import usual_difference
 from orthocal.hypotheses.hypothesis import Rows
+from orthocal.observation.gauge_noise import usual_difference
 from orthocal.session.session import Conditions, Gauge
 from orthocal.statistics.noise import estimate_repeatability
 
