@@ -12,7 +12,8 @@ from orthocal.arrays import Array, Indices
 from orthocal.assessment.plausibility import name_if_several
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
-from orthocal.assessment.words.anomalies import MAX_PLACES, command_to_restart, place_of
+from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
+from orthocal.assessment.words.remedies import command_to_restart
 from orthocal.calibration.assessment_record import Finding
 from orthocal.hypotheses.hypothesis import Rows, group_rows
 from orthocal.hypotheses.linear_model import linear_model
