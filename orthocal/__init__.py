@@ -11,11 +11,7 @@ Five lines do the main job:
 
 from __future__ import annotations
 
-import ast
-import sys
-from functools import cache
 from importlib import import_module
-from inspect import getsource
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -125,26 +121,86 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.viewer.live import LiveScene as LiveScene
     from orthocal.viewer.scene import Scene as Scene
 
+_NAMES = {
+    "assessment.adjustment_plan": "AdjustmentPlan plan_adjustments",
+    "assessment.assess": "assess calibrate check_session",
+    "assessment.comparison": "Comparison compare_models",
+    "assessment.judgement": "Judgement judge_session",
+    "assessment.recommendation": "Recommendation recommend_model",
+    "assessment.tool_error": "ToolAccuracy assess_tool",
+    "assessment.validation": "Validation validate_calibration",
+    "builder.biglide": "Biglide",
+    "builder.build": "make_robot",
+    "builder.dimensions": "Dimensions",
+    "builder.linear_delta": "LinearDelta",
+    "builder.orthoglide": "InclinedOrthoglide Orthoglide",
+    "calibration.adjusting": "adjust_calibration",
+    "calibration.assessment_record": "Assessment Decision Finding",
+    "calibration.calibration": "Calibration",
+    "calibration.file": "load_calibration write_calibration",
+    "calibration.machine": "Machine",
+    "calibration.refit": "repeat_calibration restore_session",
+    "calibration.tables": "parameter_table reading_table",
+    "effects.loading": "load_robot",
+    "effects.protocol": "Effect EffectKeys",
+    "effects.registry": "register_effect",
+    "errors": (
+        "CalibrationFileError ClosureError ExportError GcodeError NotIdentifiableError "
+        "OrthocalError OutputError ParameterError RobotError SessionError SolverError "
+        "UnreachableError"
+    ),
+    "estimation.choice": "Choice",
+    "estimation.loss": "Loss",
+    "estimation.options": "SolverOptions",
+    "estimation.problem": "CalibrationProblem",
+    "estimation.solvers.ipopt": "NonlinearProgram",
+    "export.formats": "export_calibration",
+    "export.linuxcnc.export": "ExportOptions",
+    "kinematics.conditions": "UseConditions",
+    "kinematics.workspace": "Workspace",
+    "measurement.files.session_file": "load_plan load_session",
+    "measurement.files.write_session": "write_session",
+    "measurement.importing.import_readings": (
+        "TableImport TableOptions import_readings write_import"
+    ),
+    "measurement.joining": "join_sessions",
+    "observation.simulate": "draw_errors simulate_session",
+    "output.report.page": "write_report",
+    "output.scene.drawing": "draw_scene",
+    "output.text.summary": "summarize",
+    "planning.equipment": "Equipment",
+    "planning.plan": "MeasuringPlan plan_readings",
+    "robot.model": "Robot",
+    "robot.parameters": "ElementaryError",
+    "sensors.leg_indicator": "LegIndicator Section",
+    "sensors.mounting": "Mounting",
+    "sensors.protocol": "Contact Frames NuisanceParameter Sensor SetupKeys TouchingTip View",
+    "sensors.registry": "register_sensor",
+    "sensors.tips": "Tip",
+    "session.session": "Conditions Gauge Posture Reading Session Setup",
+    "study.accuracy": "build_accuracy_study",
+    "study.bootstrap": "build_bootstrap_study",
+    "study.linearisation": "build_linearisation_study",
+    "study.runner": "StudyTable run_study",
+    "study.sensitivity": "build_sensitivity_study",
+    "study.study": "Study",
+    "viewer.live": "LiveScene",
+    "viewer.scene": "Scene",
+}
+"""Modules, mapped to their public names: those that type checkers import above."""
 
-@cache
-def _public_names() -> dict[str, str]:
-    """Public names and the modules that define them, read from the imports above."""
-    source = ast.parse(getsource(sys.modules[__name__]))
-    block = next(node for node in source.body if isinstance(node, ast.If))
-    imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
-    return {name.name: str(node.module) for node in imports for name in node.names}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
+__all__ = sorted(_MODULES)
 
 if not TYPE_CHECKING:  # type checkers report unknown names
 
     def __getattr__(name: str) -> Any:  # noqa: ANN401 - any public name
         """Import a public name on first use, so that start-up stays fast."""
-        if name == "__all__":
-            return sorted(_public_names())
-        if name.startswith("__") or name not in _public_names():
+        if name not in _MODULES:
             raise AttributeError(f"module 'orthocal' has no attribute '{name}'")
-        return getattr(import_module(_public_names()[name]), name)
+        return getattr(import_module(f"orthocal.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_public_names()})
+    return sorted({*globals(), *_MODULES})

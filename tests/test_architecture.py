@@ -123,6 +123,13 @@ def test_functions_have_at_most_60_lines():
     assert not longer
 
 
+def test_type_checkers_know_the_public_names():
+    block = next(n for n in parsed(ROOT / "orthocal/__init__.py").body if isinstance(n, ast.If))
+    imports = {a.name: node.module for node in block.body for a in node.names}
+    assert imports == {n: f"orthocal.{m}" for n, m in orthocal._MODULES.items()}
+    assert sorted(imports) == orthocal.__all__
+
+
 def test_everything_exported_is_there():
     for name in orthocal.__all__:
         assert getattr(orthocal, name) is not None

@@ -255,6 +255,17 @@ def test_numbers_of_studies(build, arguments, experiment_2):
         build(experiment_2, **arguments)
 
 
+def test_a_loaded_robot_which_others_share_is_read_only(orthoglide):
+    assert load_robot("orthoglide") is load_robot("orthoglide")
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        orthoglide.legs["x"] = orthoglide.legs["y"]
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        orthoglide.legs["x"].rods["a"] = orthoglide.legs["x"].rods["b"]
+    for array in (orthoglide.drive_index, orthoglide.passive_index, orthoglide.drive_gain):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
 @pytest.mark.parametrize("copied", [lambda x: pickle.loads(pickle.dumps(x)), deepcopy])
 def test_sessions_and_calibrations_can_be_pickled(copied, calibration, experiment_2, orthoglide):
     errors = {"x_slide.offset": 1e-3}

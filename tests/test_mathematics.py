@@ -26,11 +26,11 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.observation.gauge_noise import noise_floor
 from orthocal.robot.model import joint_axis
 from orthocal.robot.parameters import AXES
 from orthocal.sensors.leg_indicator import Section
 from orthocal.statistics.distributions import t_quantile
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 EXPERIMENT = ROOT / "examples/table1/experiment-2"

@@ -162,7 +162,7 @@ def compare_models(
         title=session.title,
         labels=_label_rows(session),
         noises=noises,
-        independent=results[0].redundancy + results[0].rank if results else 0,
+        independent=results[0].calibration.identifiability.n_readings if results else 0,
         results=results,
         undetermined=undetermined,
         repetition=None,

@@ -20,13 +20,12 @@ from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA, noise_floor
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, split_label
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 STANDSTILL = 1e-6
@@ -75,9 +74,10 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
 
 def _redundancy(calibration: Calibration) -> list[Finding]:
     """Finding about a fit without redundant readings."""
-    if calibration.redundancy > 0:
+    if calibration.is_checked:
         return []
-    return [words.no_redundancy(calibration.identifiability.n_readings, len(calibration.free))]
+    readings, errors = calibration.identifiability.n_readings, len(calibration.free)
+    return [words.no_redundancy(readings, errors, mounting=readings > calibration.rank)]
 
 
 def _residuals(calibration: Calibration) -> list[Finding]:
@@ -132,11 +132,11 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
     if noise.source == "unknown":
         return words.noise_unknown()
     if noise.source == "gauge":
-        if calibration.redundancy > 0:
+        if calibration.is_checked:
             return words.fits(noise.sigma, STATED)
         return words.noise_as_stated(noise.sigma)
     if noise.source == "cycles":
-        if calibration.redundancy > 0:
+        if calibration.is_checked:
             return words.fits(noise.cycles_sigma, REPEATED)
         return words.noise_from_cycles(noise.cycles_sigma)
     if noise.cycles_dof > 0:

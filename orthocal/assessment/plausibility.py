@@ -18,10 +18,10 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.hypotheses.families.unit_and_sign import decimal_steps
 from orthocal.measurement.joining import split_sessions
+from orthocal.observation.gauge_noise import noise_floor
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import INCH, MM
 
@@ -92,12 +92,13 @@ def find_implausible(session: Session, *, explained: bool = False) -> tuple[Find
 def find_impossible_gauges(session: Session) -> Iterator[Finding]:
     """Findings about gauges with an impossible noise or resolution, on which all evidence depends.
 
+    Gauges without readings are not judged: no evidence depends on them.
     A noise of many times the resolution is in a wrong unit, and so is a resolution if the range has
     only a few steps. If readings are between steps, the resolution is wrong if it is many times the
     noise, or if the readings span only a few steps. If all readings are multiples of ten steps, it
     is wrong if such a rounding is larger than the stated noise.
     """
-    for name, gauge in session.gauges.items():
+    for name, gauge in session.gauges_with_readings.items():
         step, sigma = gauge.resolution, gauge.sigma
         if not step:
             continue
@@ -135,7 +136,7 @@ def _coarser_step(values: Array, step: float) -> float:
 
 def find_finer(session: Session) -> Iterator[Finding]:
     """Findings about gauges with at least half of their readings between the steps."""
-    for name, gauge in session.gauges.items():
+    for name, gauge in session.gauges_with_readings.items():
         rows = _rows_of(session, name)
         if finer := _finer_rows(session, rows, gauge):
             step = gauge.resolution or 0.0

@@ -25,6 +25,7 @@ from orthocal.calibration.refit import restore_mounting_covariance
 from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
+from orthocal.observation.gauge_noise import noise_floor
 from orthocal.observation.observations import Observations
 from orthocal.session.session import known_approach, split_label
 from orthocal.statistics.chance import BY_CHANCE
@@ -35,7 +36,7 @@ from orthocal.statistics.distributions import (
     least_number,
     median_of_largest,
 )
-from orthocal.statistics.noise import FEW_DOF, noise_floor
+from orthocal.statistics.noise import FEW_DOF
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
 MAX_STEPS = 12

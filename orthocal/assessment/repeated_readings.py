@@ -12,13 +12,14 @@ from orthocal.arrays import Array, Indices
 from orthocal.assessment.plausibility import name_if_several
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
-from orthocal.assessment.words.anomalies import MAX_PLACES, command_to_restart, place_of
+from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
+from orthocal.assessment.words.remedies import command_to_restart
 from orthocal.calibration.assessment_record import Finding
-from orthocal.estimation.weighting import ROUNDING_ERROR, stated_sigma, usual_difference
 from orthocal.hypotheses.hypothesis import Rows, group_rows
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.motion.approach import label_reading
+from orthocal.observation.gauge_noise import ROUNDING_ERROR, stated_sigma, usual_difference
 from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 from orthocal.units import MM

@@ -18,8 +18,8 @@ from orthocal.estimation.fit import Fit, fit_problem, require_determined
 from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.weighting import SMALLEST_SIGMA
-from orthocal.statistics.information import assume_others_known, decompose
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA
+from orthocal.statistics.information import decompose
 from orthocal.statistics.noise import Noise
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
@@ -44,8 +44,10 @@ class Score:
     aicc: float
     """m + 2 k + 2 k (k + 1)/(n − k − 1); infinite if n − k − 1 is not positive.
 
-    m = n ln(Σ (r/w)²/n) + Σ ln w² over independent readings, with the estimated noise w of their
-    gauge relative to that of the first gauge."""
+    m = n ln(Σ (r/w)²/n) + Σ ln w² over independent readings, with the noise w of their gauge
+    relative to that of the first gauge. k is the effective number of parameters, plus 1 for the
+    noise that m eliminates, plus the number of ratios w that are estimated. Stated ratios are known
+    and do not count; gauges with few readings share one estimate."""
     bic: float
     """m + k ln n; infinite without degrees of freedom."""
     prediction_error: Array
@@ -65,11 +67,6 @@ class ModelResult:
 
     model: str
     n_free: int
-    rank: int
-    """Number of combinations of its parameters that readings without noise would determine."""
-    redundancy: int
-    """Independent readings minus the rank: number of checks of the model. Repeated readings count
-    once."""
     effective: float
     """Effective number of parameters."""
     prior: bool
@@ -83,6 +80,16 @@ class ModelResult:
     """Tool errors; None for a robot without a tool centre point."""
     linearisation_cost: ErrorStatistics | None
     """Difference of the tool position between both estimates after alignment."""
+
+    @property
+    def rank(self) -> int:
+        """See `Calibration.rank`."""
+        return self.calibration.rank
+
+    @property
+    def redundancy(self) -> float:
+        """See `Calibration.redundancy`."""
+        return self.calibration.redundancy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,15 +123,12 @@ def score_model(
     """
     fit = fit_problem(problem, options=options)
     linearisation = fit.linearisation
-    rank = assume_others_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
     tool = _assess_tool(calibration)
     effective = _effective_parameters(fit)
     return ModelResult(
         model=problem.selection.label,
         n_free=problem.n_machine,
-        rank=rank,
-        redundancy=fit.independent_readings - rank,
         effective=effective,
         prior=bool(problem.machine_selection.prior.any()),
         by_choice=by_choice,
@@ -177,7 +181,7 @@ def _score(
     sum_of_squares = float(residual @ residual)
     errors = residual * problem.noise_ratio
     rows = observations.rows(errors)
-    k = effective + 1.0  # with the noise
+    k = effective + 1.0 + fit.noises.estimated_ratios
     denominator = count - k - 1.0
     # without any scatter all models fit equally well
     mean_square = max(sum_of_squares / count, SMALLEST_SIGMA**2)

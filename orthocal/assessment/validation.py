@@ -33,7 +33,8 @@ from orthocal.assessment.predictive import (
 from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.assessment.wording import describe_actions, join_texts
 from orthocal.assessment.words import validation as words
-from orthocal.assessment.words.anomalies import command_to_restart, place_of
+from orthocal.assessment.words.anomalies import place_of
+from orthocal.assessment.words.remedies import command_to_restart
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
     EXIT_CODES,

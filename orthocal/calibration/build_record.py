@@ -48,7 +48,7 @@ from orthocal.statistics.identifiability import (
     Identifiability,
     analyse_identifiability,
 )
-from orthocal.statistics.information import marginalise
+from orthocal.statistics.information import Information, count_others, marginalise
 from orthocal.statistics.zeros import project_out_zeros
 
 
@@ -170,16 +170,23 @@ def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
 
 
 def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Identifiability:
-    """Identifiability of the free parameters, or of all if base parameters were estimated."""
+    """Identifiability of the free parameters, or of all if base parameters were estimated.
+
+    Its unit is metres of the gauge with the least noise, whichever gauge is the first.
+    """
+    finest = float(fit.problem.noise_ratio.min())
 
     def analyse(linearisation: LinearProblem) -> Identifiability:
-        machine = linearisation.problem.machine_selection.parameters
+        machine, sigma = linearisation.problem.machine_selection, finest * fit.sigma
+        information = Information(finest * linearisation.information.factor)
+        n = len(machine.parameters)
         return analyse_identifiability(
-            marginalise(linearisation.information, len(machine), sigma=fit.sigma),
-            machine,
-            sigma=fit.noise.sigma,
+            marginalise(information, n, sigma=sigma),
+            machine.parameters,
+            sigma=finest * fit.noise.sigma,
             n_postures=len(fit.problem.session.postures),
             n_readings=fit.independent_readings,
+            n_nuisance=count_others(information, n, sigma=sigma),
         )
 
     solved = analyse(fit.linearisation)
@@ -189,7 +196,10 @@ def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Ident
         linearise_problem(full_problem.with_noise_ratio(fit.problem.noise_ratio))
     )
     return replace(
-        combinations, singular_values=solved.singular_values, rank=solved.structural_rank
+        combinations,
+        singular_values=solved.singular_values,
+        rank=solved.structural_rank,
+        n_nuisance=solved.n_nuisance,
     )
 
 

@@ -24,6 +24,7 @@ from orthocal.robot.model import Robot
 from orthocal.robot.parameters import suggest
 from orthocal.sensors.protocol import is_difference
 from orthocal.statistics.chance import bounded_interval, expanded_uncertainty
+from orthocal.statistics.noise import MIN_DOF
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -83,10 +84,24 @@ class Calibration(CalibrationRecord):
         return tuple(sorted(pairs, key=lambda p: -abs(p[2])))
 
     @property
-    def redundancy(self) -> int:
-        """Independent readings minus resolvable parameters: number of checks of the model."""
-        rank = len(self.free) if self.base else self.identifiability.structural_rank
-        return self.identifiability.n_readings - rank
+    def redundancy(self) -> float:
+        """Number of checks of the model: independent readings that determine no parameters.
+
+        A reading may determine a nuisance parameter in part; its prior determines the other part.
+        Priors of the machine do not count.
+        """
+        spectrum = self.identifiability
+        return max(spectrum.n_readings - self.rank - spectrum.n_nuisance, 0.0)
+
+    @property
+    def rank(self) -> int:
+        """Number of combinations of errors that readings without noise would determine."""
+        return len(self.free) if self.base else self.identifiability.structural_rank
+
+    @property
+    def is_checked(self) -> bool:
+        """True if there are enough redundant readings for residuals to check the model."""
+        return self.redundancy >= MIN_DOF
 
     @property
     def suspicious(self) -> tuple[ResidualRow, ...]:

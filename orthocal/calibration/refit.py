@@ -19,9 +19,9 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.tolerance_scale import ToleranceScale
-from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA
 from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.statistics.information import Information, decompose
 

@@ -41,7 +41,8 @@ class ToleranceKeys(GeometryTolerances, DriveTolerances):
 def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     """Load a robot from its URDF and YAML, check them against each other and close its loops.
 
-    Robots are immutable: unchanged files give the same object again.
+    Unchanged files give the same object again. Its arrays, legs and rods are read-only. Do not
+    modify its Pinocchio `model`, but a copy.
 
     Args:
         robot: Name of a built-in robot, or path to a robot directory.

@@ -148,6 +148,20 @@ class Effect:
         """Changes of the lengths of rods by leg and rod, [m]; effects on one rod add up."""
         return {}
 
+    def negligible_difference(self, condition: Condition, change: float) -> float:
+        """Difference of a condition that changes no reading by more than an amount.
+
+        Readings under such conditions repeat each other. By default only equal conditions do.
+
+        Args:
+            condition: Condition that the effect needs.
+            change: Largest change of a reading, [m].
+
+        Returns:
+            In the unit of the condition.
+        """
+        return 0.0
+
     def tool_force(self, payload: float) -> Array:
         """Force on the tool centre point, from which the condition `load` is computed.
 

@@ -11,6 +11,7 @@ point together with the screws changes only the scale of the machine.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Self
@@ -99,6 +100,21 @@ class Thermal(Effect):
         """Changes of the lengths of rods (see `Effect.rods`)."""
         growth = self._growth("legs", errors, conditions)
         return {name: growth * rod.length for name, rod in self.robot.rods.items()}
+
+    def negligible_difference(self, condition: Condition, change: float) -> float:
+        """Difference of temperature (see `Effect.negligible_difference`), [K].
+
+        Per kelvin, the longest rod and the longest screw, from its fixed bearing to the mechanical
+        zero, grow by no more than their coefficients at the upper tolerance.
+        """
+        drives = zip(self.robot.drives, self.fixed, strict=True)
+        rods = (rod.length for rod in self.robot.rods.values())
+        screws = (abs(d.zero - f) for d, f in drives if f is not None)
+        growth = 0.0
+        for error, lengths in zip(self.errors, (rods, screws), strict=True):
+            limit = abs(self.expansion[error.owner]) + 2.0 * error.prior_std
+            growth += limit * max(lengths, default=0.0)
+        return change / growth if growth else math.inf
 
 
 def _fixed_points(keys: ThermalKeys, robot: Robot) -> tuple[float | None, ...]:

@@ -18,7 +18,6 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import Program, Solution, advise
 from orthocal.estimation.weighting import (
-    SMALLEST_SIGMA,
     GaugeReadings,
     NoiseEstimate,
     Scatter,
@@ -30,6 +29,7 @@ from orthocal.estimation.weighting import (
     with_initial_noise,
     with_repeatability,
 )
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA
 from orthocal.statistics.information import (
     Information,
     Posterior,

@@ -18,32 +18,15 @@ import numpy as np
 from orthocal.arrays import Array, Mask
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.observation.gauge_noise import (
+    SMALLEST_SIGMA,
+    assumed_sigma,
+    stated_sigma,
+)
 from orthocal.observation.observations import Observations
 from orthocal.session.session import Gauge, Session
-from orthocal.statistics.noise import (
-    Noise,
-    combine_noises,
-    estimate_noise,
-    estimate_repeatability,
-    noise_floor,
-)
+from orthocal.statistics.noise import Noise, combine_noises, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
-
-DEFAULT_SIGMA = 10e-6
-"""Assumed noise of a gauge that does not state it, [m]."""
-
-USUAL_STDS = 4.0
-"""Largest usual difference of two readings of one posture, in standard deviations of a difference:
-of about 16,000 correct ones one is larger."""
-
-USUAL_STEPS = 3
-"""The same in steps of a gauge whose noise is not stated."""
-
-ROUNDING_ERROR = 1e-9
-"""Rounding error of a difference of two readings, [m]."""
-
-SMALLEST_SIGMA = 1e-9
-"""Smallest standard deviation of a reading, [m]; below it readings count as perfect."""
 
 MIN_DOF = 3.0
 """Degrees of freedom below which readings do not determine the noise of one of several gauges."""
@@ -80,28 +63,6 @@ def with_repeatability(
     """The gauges with the scatter of their repeated cycles."""
     o, values = problem.observations, problem.values * problem.noise_ratio
     return tuple(replace(g, repeatability=_repeatability(values, o, g)) for g in groups)
-
-
-def stated_sigma(gauge: Gauge) -> float:
-    """Standard deviation of a reading from stated noise and resolution, [m]; 0 without both."""
-    return noise_floor(gauge.sigma, gauge.resolution)
-
-
-def usual_difference(gauge: Gauge) -> float:
-    """Largest usual difference of two readings of one posture, [m]; 0 if unknown.
-
-    It is a multiple of the resolution.
-    """
-    step = gauge.resolution or 0.0
-    if not gauge.sigma:
-        return USUAL_STEPS * step
-    largest = USUAL_STDS * math.sqrt(2.0) * stated_sigma(gauge)
-    return max(math.floor(largest / step), 1) * step if step else largest
-
-
-def assumed_sigma(gauge: Gauge) -> float:
-    """Standard deviation of a reading, [m], with DEFAULT_SIGMA for a gauge that states none."""
-    return max(noise_floor(gauge.sigma or DEFAULT_SIGMA, gauge.resolution), SMALLEST_SIGMA)
 
 
 def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
@@ -164,6 +125,8 @@ class NoiseEstimate:
     """Noise of the first gauge, with the degrees of freedom and residuals of all gauges."""
     ratio: Array
     """Noise of each entry relative to the first gauge, shape (n_entries,)."""
+    estimated_ratios: int = 0
+    """Number of ratios between gauges that are estimated from the readings, not stated."""
 
     def with_sigmas(self, groups: Sequence[GaugeReadings], sigmas: Array) -> NoiseEstimate:
         """The estimate with standard deviations of the entries, shape (n_entries,), [m].
@@ -171,10 +134,11 @@ class NoiseEstimate:
         An unknown noise remains unknown.
         """
         firsts = [float(sigmas[g.entries][0]) for g in groups]
-        return NoiseEstimate(
-            tuple(n.with_sigma(s) for n, s in zip(self.gauges, firsts, strict=True)),
-            self.common.with_sigma(firsts[0]),
-            sigmas / firsts[0],
+        return replace(
+            self,
+            gauges=tuple(n.with_sigma(s) for n, s in zip(self.gauges, firsts, strict=True)),
+            common=self.common.with_sigma(firsts[0]),
+            ratio=sigmas / firsts[0],
         )
 
 
@@ -221,7 +185,8 @@ class Scatter:
         first = float(sigmas[self.groups[0].entries][0])
         pooled = self.pool(self.groups, sigmas).scaled(first)
         common = combine_noises(noises, pooled, sigma=first)
-        return NoiseEstimate(tuple(noises), common, sigmas / first)
+        ratios = _count_estimated_ratios(noises, few)
+        return NoiseEstimate(tuple(noises), common, sigmas / first, ratios)
 
     def common(self) -> Noise:
         """Noise of the first gauge, with the present ratios of the gauges."""
@@ -264,6 +229,20 @@ class Scatter:
 def _is_determined(noise: Noise) -> bool:
     """True if there are enough readings for the noise of one of several gauges."""
     return max(noise.cycles_dof, noise.residual_dof) >= MIN_DOF
+
+
+def _count_estimated_ratios(noises: Sequence[Noise], few: Sequence[int]) -> int:
+    """Number of noise ratios of several gauges that their readings determine.
+
+    Gauges with a stated or unknown noise have known ratios to each other.
+
+    Args:
+        noises: Noise of each gauge.
+        few: Indices of the gauges that share one factor.
+    """
+    is_estimated = [n.source in ("cycles", "residuals") for n in noises]
+    estimates = {-1 if i in few else i for i, estimated in enumerate(is_estimated) if estimated}
+    return len(estimates) - all(is_estimated)
 
 
 def _root_mean_square(values: Array) -> float:

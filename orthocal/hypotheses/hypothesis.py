@@ -10,8 +10,8 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from orthocal.arrays import Array, Indices, Mask
-from orthocal.estimation.weighting import assumed_sigma
 from orthocal.hypotheses.anomaly import Explanation
+from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.protocol import reads_pairs, states_readings
 from orthocal.session.session import Gauge, Session

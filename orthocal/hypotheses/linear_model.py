@@ -18,7 +18,7 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import assumed_sigma, initial_sigmas, split_by_gauge
+from orthocal.estimation.weighting import initial_sigmas, split_by_gauge
 from orthocal.hypotheses.hypothesis import (
     MAX_DENSE_COLUMNS,
     MachineShift,
@@ -28,6 +28,7 @@ from orthocal.hypotheses.hypothesis import (
 )
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
+from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.session.session import Session, split_label
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 

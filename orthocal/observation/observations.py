@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -18,12 +18,17 @@ from orthocal.kinematics.conditions import APPROACH, UseConditions
 from orthocal.kinematics.error_map import error_map
 from orthocal.kinematics.loop_closure import LoopClosure, find_loads
 from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
+from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
 from orthocal.text import spans
 
 READING_INTERVAL = 60.0
 """Assumed time between successive readings of a setup without times, [s]."""
+
+NEGLIGIBLE_CHANGE = 0.5
+"""Largest change of repeated readings by their conditions, in standard deviations of a reading. It
+increases their variance by at most a sixteenth, and their scatter by 3 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +90,9 @@ class Observations:
     second: Indices
     """Index of the loop closure in the second posture of a pair, or -1, shape (n,)."""
     place: Indices
-    """Index of setup, posture, approach and the other stated conditions on which the model depends,
-    shape (n,): equal for repeated readings."""
+    """Index of the place of each entry, shape (n,): equal for repeated readings. They have the same
+    setup, posture and approach. If the model depends on temperature or time, the differences of
+    these change a reading by at most NEGLIGIBLE_CHANGE."""
     conditions: Mapping[Condition, Array]
     """Values of each condition, shape (n, size); neutral where not stated."""
     states: States
@@ -220,7 +226,6 @@ def build_observations(session: Session) -> Observations:
             minus.append(find_or_add(r, r.minus))
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
     values, states, state, second = _observe(session, conditions, table, pairs)
-    places = np.hstack([table[:, :2], second[:, None], *_repeated_conditions(session, values)])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
     absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
     return Observations(
@@ -235,7 +240,7 @@ def build_observations(session: Session) -> Observations:
         minus=np.array(minus, dtype=np.int64),
         state=state,
         second=second,
-        place=np.unique(places, axis=0, return_inverse=True)[1].reshape(-1),
+        place=_find_places(session, np.column_stack([table[:, :2], second]), values),
         conditions=values,
         states=states,
     )
@@ -348,14 +353,45 @@ def _condition_values(
     return values
 
 
-def _repeated_conditions(session: Session, values: Mapping[Condition, Array]) -> Iterator[Array]:
-    """Values of the stated conditions that are equal in repeated readings, shape (n, size) each.
+def _find_places(session: Session, postures: Indices, values: Mapping[Condition, Array]) -> Indices:
+    """Index of the place of each entry, shape (n,); see `Observations.place`.
 
-    These are the approach, and temperature and time if an effect of the robot depends on them.
+    Args:
+        session: The session.
+        postures: Indices of setup, posture and second posture of the entries, shape (n, 3).
+        values: Conditions of the entries.
     """
-    needed = {c for effect in robot_effects(session.robot) for c in effect.conditions}
-    yield values["approach"]
-    yield from (values[c] for c in ("temperature", "time") if c in needed)
+    setups = session.setups.values()
+    noise = np.array([assumed_sigma(session.gauges[s.gauge]) for s in setups])
+    place = _number_rows(np.hstack([postures, values["approach"]]))
+    for condition in ("temperature", "time"):
+        for effect in robot_effects(session.robot):
+            if condition in effect.conditions:
+                changes = NEGLIGIBLE_CHANGE * noise
+                tolerance = np.array([effect.negligible_difference(condition, c) for c in changes])
+                place = _split_places(place, values[condition][:, 0], tolerance[postures[:, 0]])
+    return place
+
+
+def _number_rows(rows: Array) -> Indices:
+    """Index of each row among the different rows, shape (n,)."""
+    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _split_places(place: Indices, value: Array, tolerance: Array) -> Indices:
+    """Places, each within a tolerance of its smallest value of a condition, shape (n,).
+
+    Args:
+        place: Index of the place of each entry, shape (n,).
+        value: Condition of each entry, shape (n,).
+        tolerance: Largest difference in the place of each entry, shape (n,).
+    """
+    first, number, result = -1, -1, np.empty_like(place)
+    for i in np.lexsort((value, place)):
+        if first < 0 or place[i] != place[first] or value[i] > value[first] + tolerance[i]:
+            first, number = i, number + 1
+        result[i] = number
+    return result
 
 
 def _find_loads(session: Session, setup: Indices, posture: Indices) -> Array:

@@ -18,10 +18,10 @@ from orthocal.arrays import Array, Indices
 from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_reachable

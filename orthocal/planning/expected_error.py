@@ -26,12 +26,13 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.weighting import split_by_gauge, stated_sigma
+from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE
 from orthocal.robot.model import Robot

@@ -11,10 +11,10 @@ from orthocal.arrays import Array
 from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.choice import Choice
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import state_common_approach
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.candidates import ON_AXIS, directions_across
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name
 from orthocal.planning.expected_error import Expected, ToolForecast

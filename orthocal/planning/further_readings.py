@@ -15,7 +15,7 @@ from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.effect_separability import WARMER
 from orthocal.effects.loading import measurable_effects, neutral_values
 from orthocal.effects.protocol import Condition
-from orthocal.estimation.weighting import stated_sigma
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.plan_comparison import Comparison
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session

@@ -11,9 +11,9 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, model_validator
 
 from orthocal.errors import SessionError
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.io.documents import Keys, Number, read_yaml, validate
 from orthocal.measurement.files.session_keys import GaugeKeys
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM

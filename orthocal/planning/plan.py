@@ -17,9 +17,9 @@ from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.motion.approach import usual_approaches
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.candidates import (
     MIN_READINGS,
     Candidates,
@@ -486,8 +486,8 @@ def _list_counts(
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError(
-                "found together with --setups or --readings; state hours, or setups and readings",
-                where="--hours",
+                "found together with setups or readings; state hours, or setups and readings",
+                where="hours",
             )
         options = []
         for each in READINGS_PER_SETUP:
@@ -499,19 +499,19 @@ def _list_counts(
             raise ParameterError(
                 f"found {hours:g}; expected at least {min_hours:.2g}, a setup of "
                 f"{READINGS_PER_SETUP[0]} readings, and at most {MAX_SETUPS} setups",
-                where="--hours",
+                where="hours",
             )
         return options
     count = USUAL_SETUPS if setups is None else setups
     mean = READINGS_PER_SETUP[0] + (EXTRA_FOR_APPROACH if usual_approaches(robot) else 0.0)
     total = math.ceil(mean * count - 1e-9) if readings is None else readings
     if not 1 <= count <= MAX_SETUPS:
-        raise ParameterError(f"found {count}; expected 1 to {MAX_SETUPS}", where="--setups")
+        raise ParameterError(f"found {count}; expected 1 to {MAX_SETUPS}", where="setups")
     if total < MIN_READINGS * count:
         raise ParameterError(
             f"found {total}; expected at least {MIN_READINGS * count}, {MIN_READINGS} for each of "
             f"{count} setups: a single reading only determines the gauge zero",
-            where="--readings",
+            where="readings",
         )
     return [[total // count + (i < total % count) for i in range(count)]]
 

@@ -65,8 +65,8 @@ def packaged_robots() -> dict[str, Path]:
 def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     """Load a robot without its error parameters, which `orthocal.effects.loading` adds.
 
-    URDF and YAML are checked against each other, and the loops are closed. Robots are immutable:
-    the same files return the same object.
+    URDF and YAML are checked against each other, and the loops are closed. The same files return
+    the same object.
 
     Args:
         robot: Name of a built-in robot, or path to a robot directory.
@@ -166,8 +166,10 @@ def _build_robot(
     model = load_urdf(urdf_path, content=urdf, joint_types=keys.joint_types, declared_in=where)
 
     drives = tuple(_build_drive(model, motor, keys, where) for motor in keys.name_mot)
-    drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]
-    passive_index = [i for i in range(model.nv) if i not in drive_index]
+    drive_index = np.array([model.joints[model.getJointId(d.name)].idx_v for d in drives])
+    passive_index = np.setdiff1d(np.arange(model.nv), drive_index)
+    for index in (drive_index, passive_index):
+        index.setflags(write=False)
     closures = _build_closures(model, keys, where)
     robot = Robot(
         name=name,
@@ -192,8 +194,8 @@ def _build_robot(
             adjustments=keys.orthocal.adjustments,
         ),
         parameters=ParameterSet(),
-        drive_index=np.array(drive_index, dtype=np.int64),
-        passive_index=np.array(passive_index, dtype=np.int64),
+        drive_index=drive_index,
+        passive_index=passive_index,
         reference_posture=read_only(np.zeros(model.nv)),
         drive_gain=read_only(np.ones(len(drives))),
     )
@@ -366,7 +368,7 @@ def _snap_to_axes(unit_vector: Array) -> Array:
     return np.where(np.abs(unit_vector - nearest) < 1e-12, nearest, unit_vector)
 
 
-def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
+def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> Mapping[str, Leg]:
     """Build the legs and their rods in the reference posture."""
     model, legs = robot.model, {}
     data = model.createData()
@@ -399,9 +401,9 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             ),
             root_driven=bool(by_passive < 1e-9),
             root_motion=read_only(_snap_to_axes(motion)),
-            rods=rods,
+            rods=MappingProxyType(rods),
         )
-    return legs
+    return MappingProxyType(legs)
 
 
 def _build_line(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -171,6 +172,15 @@ class Use:
     """Lightest and heaviest mass on the tool in addition to the platform, [kg]."""
 
 
+def _read_only_mapping(content: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    """Read-only mapping from its pickled content."""
+    return MappingProxyType(content)
+
+
+# pickle and deepcopy do not support the read-only mappings of a robot by themselves
+copyreg.pickle(MappingProxyType, lambda mapping: (_read_only_mapping, (dict(mapping),)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
     """Robot with closed loops.
@@ -192,7 +202,7 @@ class Robot:
     sha256: str
     """Digest of the URDF and the YAML."""
     model: pin.Model
-    """Pinocchio model."""
+    """Pinocchio model. Robots share it: modify a copy, `model.copy()`."""
     constraints: tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]
     """Closures as constraint models of Pinocchio, with all rows."""
     drives: tuple[Drive, ...]
@@ -227,14 +237,12 @@ class Robot:
 
     def __getstate__(self) -> dict[str, Any]:
         """State for pickle, without the constraint models, which Pinocchio does not pickle."""
-        state = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "constraints"}
-        return state | {"content": dict(self.content)}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "constraints"}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         """Restore a pickled robot, and build its constraint models."""
         for name, value in state.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "content", MappingProxyType(state["content"]))
         object.__setattr__(self, "constraints", build_constraints(self.model, self.closures))
 
     @property

@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from orthocal.arrays import Array
 from orthocal.io.documents import Count, Number
-from orthocal.io.fields import CLOSED, Many, Vector, read_only
+from orthocal.io.fields import CLOSED, Many, Size, Vector, read_only
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
@@ -83,10 +83,11 @@ class Identifiability:
     __pydantic_config__ = CLOSED
 
     singular_values: Vector
-    """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m per
-    prior std]. If base parameters were estimated, of their columns."""
+    """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m of
+    the gauge with the least noise per prior std]. If base parameters were estimated, of their
+    columns."""
     threshold: Number
-    """Smallest singular value of a resolvable direction, [m per prior std]."""
+    """Smallest singular value of a resolvable direction, in the unit of the singular values."""
     rank: Count
     """Number of singular values above the threshold."""
     structural_rank: Count
@@ -94,6 +95,9 @@ class Identifiability:
     n_postures: Annotated[Count, Field(ge=1)]
     n_readings: Count
     """Independent readings: readings minus repetitions and gauge zeros."""
+    n_nuisance: Size
+    """Effective number of nuisance parameters, with their priors: independent readings that
+    determine them instead of errors of the machine."""
     below_noise: Many[str]
     """Parameters that change the readings by less than the threshold."""
     resolvable: Many[str]
@@ -111,12 +115,13 @@ class Identifiability:
 
     @property
     def observability(self) -> dict[str, float]:
-        """Observability indices O1 to O5 of the resolvable directions, [m per prior std].
+        """Observability indices O1 to O5 of the resolvable directions.
 
         O1 = (∏ s)^(1/r)/√postures (Borm and Menq 1991), O2 = s_r/s_1 (Driels and Pathre 1990, [1]),
         O3 = s_r and O4 = s_r²/s_1 (Nahvi and Hollerbach 1994, 1996), O5 = 1/Σ 1/s (Sun and
-        Hollerbach 2008). All are 0 without resolvable directions. The indices do not compare plans
-        with different numbers r of resolvable directions.
+        Hollerbach 2008). O2 is a number; the others have the unit of the singular values. All are 0
+        without resolvable directions. The indices do not compare plans with different numbers r of
+        resolvable directions.
         """
         s = self.singular_values[: self.rank]
         if not self.rank:
@@ -137,6 +142,7 @@ def analyse_identifiability(
     sigma: float,
     n_postures: int,
     n_readings: int,
+    n_nuisance: float = 0.0,
 ) -> Identifiability:
     """Analyse an identification Jacobian.
 
@@ -147,6 +153,7 @@ def analyse_identifiability(
             without noise.
         n_postures: Postures of the session.
         n_readings: Independent readings of the session.
+        n_nuisance: Effective number of nuisance parameters.
     """
     factor, s = information.factor, information.singular_values
     smallest = RANK_THRESHOLD * float(s[0])
@@ -161,6 +168,7 @@ def analyse_identifiability(
         structural_rank=information.rank,
         n_postures=n_postures,
         n_readings=n_readings,
+        n_nuisance=n_nuisance,
         below_noise=tuple(n for n, size in zip(names, norms, strict=True) if size <= threshold),
         resolvable=tuple(n for n, ok in zip(names, resolvable, strict=True) if ok),
         alike=_find_alike(factor, parameters, threshold),
@@ -213,7 +221,9 @@ def _find_alike(
     """Groups of parameters whose columns are multiples of each other within the threshold."""
     norms = np.linalg.norm(factor, axis=0)
     products = factor.T @ factor
-    pending = [int(i) for i in np.argsort(-norms, kind="stable") if norms[i] > threshold]
+    # rounding errors must not decide between equal norms
+    order = np.argsort(-np.round(norms / (norms.max(initial=0.0) or 1.0), 9), kind="stable")
+    pending = [int(i) for i in order if norms[i] > threshold]
     groups = []
     while pending:
         lead, *others = pending

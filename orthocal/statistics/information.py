@@ -205,6 +205,24 @@ def assume_others_known(information: Information, n_first: int) -> Information:
     return Information(information.factor[:, :n_first])
 
 
+def count_others(information: Information, n_first: int, *, sigma: float) -> float:
+    """Effective number of the other parameters, with their priors and none of the first ones.
+
+    With F = (F₁ F₂) and the hat matrix H = F (FᵀF + σ² P⁻¹)⁻¹ Fᵀ, P⁻¹ = diag(0, I), it is
+    tr H − rank F₁ = Σ s²/(s² + σ²), s the singular values of F₂ orthogonal to the columns of F₁.
+
+    Args:
+        information: Information about all parameters.
+        n_first: Number of the first parameters.
+        sigma: Standard deviation of a reading, [m].
+    """
+    first, others = np.hsplit(information.factor, [n_first])
+    basis, values, _ = np.linalg.svd(first, full_matrices=False)
+    basis = basis[:, values > RANK_THRESHOLD * values.max(initial=0.0)]
+    s = np.linalg.svd(others - basis @ (basis.T @ others), compute_uv=False)
+    return float((s**2 / (s**2 + sigma**2)).sum())
+
+
 def decompose(jacobian: Array, observations: Observations) -> Information:
     """Decompose an identification Jacobian.
 

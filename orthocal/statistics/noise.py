@@ -15,6 +15,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.io.documents import Count
 from orthocal.io.fields import CLOSED, Size, SizeOrInf, SizeOrNaN
+from orthocal.observation.gauge_noise import noise_floor
 from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 
@@ -163,15 +164,6 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
         total += float(residual @ residual)
         dof += len(entries) - int(rank)
     return (float(np.sqrt(total / dof)) if dof else float("nan")), dof
-
-
-def noise_floor(gauge_sigma: float | None, resolution: float | None) -> float:
-    """Lower limit of the standard deviation of a reading, [m].
-
-    It combines the stated noise of the gauge and rounding, 1/√12 of the resolution, because a small
-    scatter of few readings does not disprove them.
-    """
-    return math.hypot(gauge_sigma or 0.0, (resolution or 0.0) / math.sqrt(12.0))
 
 
 def estimate_noise(

@@ -30,7 +30,7 @@ from orthocal.estimation.linear import (
 )
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
-from orthocal.estimation.weighting import stated_sigma
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.expected_error import with_gauge_noise
 from orthocal.planning.first_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.robot.model import Robot

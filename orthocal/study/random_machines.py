@@ -22,11 +22,11 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchSolver
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import Workspace, gauss_box
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import with_gauge_noise
 from orthocal.robot.model import Robot

@@ -222,10 +222,22 @@ def test_criteria_do_not_depend_on_the_order_of_the_gauges():
             assert numbers[0] == pytest.approx(numbers[1], rel=1e-5, abs=1e-9), criterion
 
 
-def test_criteria_of_several_gauges_solved_by_hand():
-    """-2 ln L of independent contrasts of variance σ²: n ln σ² and 2 ln of each gauge's ratio."""
-    session = read_with_two_gauges(("xz", "yz"), scale=1.0, seed=7)
+@pytest.mark.parametrize(
+    ("unexplained", "noises"), [(1.0, 2.0), (0.0, 1.0)], ids=["estimated", "stated"]
+)
+def test_criteria_of_several_gauges_solved_by_hand(unexplained, noises):
+    """-2 ln L of independent contrasts of variance σ²: n ln σ² and 2 ln of each gauge's ratio.
+
+    The ratio of two stated noises is known. If residuals exceed both, it is estimated as well.
+    """
+    session = read_with_two_gauges(("xz", "yz"), scale=unexplained, seed=7)
+    if not unexplained:  # half of the stated scatter, which remains the lower limit
+        problem = build_problem(session, model="offsets")
+        nominal = problem.observations.rows(problem.predict(np.zeros(3)))
+        session = session.with_values(0.5 * (session.values + nominal))
     result = scores_of(session, ["offsets"])["offsets"]
+    sources = {g.noise.source for g in result.calibration.gauges}
+    assert sources == ({"residuals"} if unexplained else {"gauge"})
     o = build_problem(session, free=["*.offset"]).observations
     sigmas = {g.name: g.noise.sigma for g in result.calibration.gauges}
     gauge_of = {n: s.gauge for n, s in session.setups.items()}
@@ -240,8 +252,10 @@ def test_criteria_of_several_gauges_solved_by_hand():
     n = sum(counts.values())
     misfit = n * math.log(square / n)
     misfit += 2.0 * sum(counts[name] * math.log(sigmas[name]) for name in sigmas)
-    k = result.effective + 1.0
+    k = result.effective + noises
     assert result.exact.bic == pytest.approx(misfit + k * math.log(n), rel=1e-7)
+    aicc = misfit + 2.0 * k + 2.0 * k * (k + 1.0) / (n - k - 1.0)
+    assert result.exact.aicc == pytest.approx(aicc, rel=1e-7)
 
 
 def test_a_parameter_at_a_bound_is_no_effective_one(raw_cycles):

@@ -33,11 +33,11 @@ from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.wording import describe_actions
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
+from orthocal.observation.gauge_noise import noise_floor
 from orthocal.output.text.answer import render_decision
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import result_json
 from orthocal.session.session import Conditions
-from orthocal.statistics.noise import noise_floor
 
 QUICK = {"solver": "variable-projection"}
 

@@ -21,6 +21,7 @@ from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.output.text.answer import describe_machine
+from orthocal.session.session import Gauge
 
 
 @pytest.fixture(scope="module")
@@ -166,6 +167,18 @@ def test_a_possible_resolution_has_no_finding(cycles, resolution):
     for limits in (cycles.gauge.range, None):
         gauge = replace(cycles.gauge, resolution=resolution, range=limits)
         assert list(find_impossible_gauges(cycles.with_gauge(gauge))) == []
+
+
+def test_a_gauge_without_readings_is_not_judged(cycles):
+    """A bar whose stated noise is in a wrong unit, mounted in a setup that is not read."""
+    wrong = Gauge(10e-3, 1e-6, (-2e-6, 2e-6))
+    first, *others = cycles.setups
+    setups = {**cycles.setups, first: replace(cycles.setups[first], gauge="bar")}
+    session = replace(cycles, gauges={**cycles.gauges, "bar": wrong}, setups=setups)
+    assert len(list(find_impossible_gauges(session))) == 2  # its noise and its range
+    unread = session.select([r for r in session.readings if r.setup in others])
+    unread = replace(unread, gauges=session.gauges, setups=setups)
+    assert not list(find_impossible_gauges(unread))
 
 
 def test_a_leg_of_250_metres_is_refused(tmp_path):

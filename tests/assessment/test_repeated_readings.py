@@ -26,8 +26,9 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
 from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.weighting import usual_difference
 from orthocal.hypotheses.hypothesis import Rows
+from orthocal.observation.gauge_noise import usual_difference
+from orthocal.observation.observations import build_observations
 from orthocal.session.session import Conditions, Gauge
 from orthocal.statistics.noise import estimate_repeatability
 
@@ -135,37 +136,65 @@ def test_the_setup_is_read_again_unless_other_offsets_are_active(sound, tmp_path
 BACKLASHES = {"x_slide.backlash": 40e-6, "y_slide.backlash": 55e-6, "z_slide.backlash": 30e-6}
 
 
+def read_with_effect(effect, cycles, gauge=None):
+    """Session and observations of a plan, read in cycles at a temperature and an hour.
+
+    The errors of the effect are their tolerances.
+    """
+    rng, plan = np.random.default_rng(3), effect_plan(effect)
+    plan = plan.with_gauge(gauge or plan.gauge)
+    readings = tuple(
+        replace(r, cycle=cycle, conditions=Conditions(r.approach, celsius, FIRST + hour * HOUR))
+        for cycle, (celsius, hour) in enumerate(cycles, start=1)
+        for r in plan.readings
+    )
+    problem = build_problem(replace(plan, readings=readings), model="full", prior=True)
+    theta = problem.active_theta.copy()
+    for i, name in enumerate(problem.free):
+        if name.endswith((".expansion", ".drift")):
+            theta[i] += 2.0 * problem.theta_scale[i]
+    noise = problem.session.gauge.sigma * rng.normal(size=problem.observations.size)
+    rows = problem.observations.rows(problem.predict(theta) + noise)
+    return problem.session.with_values(rows), problem.observations
+
+
+def assert_scatter_is_noise(session, observations, *, within):
+    """Repeats estimate the noise; the relative standard deviation of the estimate is 1/√(2 ν)."""
+    sigma, dof = estimate_repeatability(session.values, observations)
+    assert dof == 60  # each of 60 readings is repeated once
+    assert sigma == pytest.approx(session.gauge.sigma, rel=within / np.sqrt(2.0 * dof))
+
+
 @pytest.mark.parametrize("effect", ["thermal", "drift"])
 def test_readings_under_conditions_on_which_the_model_depends_repeat_under_equal_ones(effect):
     """Differences by temperature or time are no scatter if an effect of the model causes them."""
-    rng = np.random.default_rng(3)
-
-    def read(cycles):
-        """Session and problem of the plan, read at each temperature and hour."""
-        plan = effect_plan(effect)
-        readings = tuple(
-            replace(r, cycle=cycle, conditions=Conditions(r.approach, celsius, FIRST + hour * HOUR))
-            for cycle, (celsius, hour) in enumerate(cycles, start=1)
-            for r in plan.readings
-        )
-        problem = build_problem(replace(plan, readings=readings), model="full", prior=True)
-        theta = problem.active_theta.copy()
-        for i, name in enumerate(problem.free):
-            if name.endswith((".expansion", ".drift")):
-                theta[i] += 2.0 * problem.theta_scale[i]
-        noise = problem.session.gauge.sigma * rng.normal(size=problem.observations.size)
-        rows = problem.observations.rows(problem.predict(theta) + noise)
-        return problem.session.with_values(rows), problem.observations
-
-    session, observations = read([(19.0, 0), (29.0, 2)])
+    session, observations = read_with_effect(effect, [(19.0, 0), (29.0, 2)])
     assert estimate_repeatability(session.values, observations)[1] == 0
     assert find_scattered(session) == ()
     without = session.with_effects([])
     assert [f.kind for f in find_scattered(without)] == ["scattered repeats"]
-    session, observations = read([(19.0, 2), (29.0, 0), (19.0, 2)])
-    sigma, dof = estimate_repeatability(session.values, observations)
-    assert dof == len(session.readings) // 3
-    assert sigma == pytest.approx(session.gauge.sigma, rel=0.2)
+    cycles = [(19.0, 2), (29.0, 0), (19.0, 2)]
+    assert_scatter_is_noise(*read_with_effect(effect, cycles), within=2.1)
+
+
+def test_readings_at_nearly_the_same_temperature_repeat_each_other():
+    """Of 0.31 m of steel, 0.1 K changes 0.4 µm, far below the noise of a dial of 0.01 mm."""
+    dial = Gauge(5e-6, 1e-5)
+    for cycles in ([(20.0, 0), (20.1, 1)], [(20.1, 0), (29.0, 1), (20.0, 2)]):
+        session, observations = read_with_effect("thermal", cycles, dial)
+        assert_scatter_is_noise(session, observations, within=2.1)
+        assert find_scattered(session) == ()
+        places = observations.place.tolist()  # readings from another side never repeat
+        approaches = [r.approach for r in session.readings]
+        assert len(set(zip(places, approaches, strict=True))) == len(set(places))
+    session, observations = read_with_effect("thermal", [(19.0, 0), (29.0, 1)], dial)
+    assert estimate_repeatability(session.values, observations)[1] == 0
+    # without the effect the temperature does not matter
+    without = build_observations(session.with_effects([]))
+    assert estimate_repeatability(session.values, without)[1] == 60
+    # 0.1 K matters to a gauge of 0.1 µm
+    session, observations = read_with_effect("thermal", [(20.0, 0), (20.1, 1)], Gauge(1e-7))
+    assert estimate_repeatability(session.values, observations)[1] == 0
 
 
 @pytest.fixture(scope="module")

@@ -20,9 +20,9 @@ from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.observation.conditions import MORNING, schedule_readings
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment

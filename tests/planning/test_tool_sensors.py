@@ -33,10 +33,10 @@ from orthocal.errors import ParameterError, SessionError, UnreachablePathError
 from orthocal.estimation.choice import resolve_choice
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
-from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
+from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
 from orthocal.output.text.plan import describe_absent, plan_json

@@ -38,7 +38,7 @@ def test_a_worker_has_a_budget_of_one(forking):
 
 
 def test_the_budget_is_restored_after_an_error(forking):
-    with pytest.raises(ParameterError, match="--setups: found 0"), cores.worker_budget(3):
+    with pytest.raises(ParameterError, match="setups: found 0"), cores.worker_budget(3):
         cores.call_in_parallel([_refuse, os.getpid])
     assert cores.current_worker_budget() == 1
 

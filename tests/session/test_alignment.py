@@ -128,6 +128,12 @@ def test_the_order_of_gauges_changes_no_estimate(setups_of_second, scale, settin
         lambda c: c.expanded_uncertainties / [p.prior_std for p in c.free],
     ):
         assert quantity(found[1]) == pytest.approx(quantity(found[0]), abs=within)
+    spectra = [c.identifiability for c in found]
+    assert spectra[1].observability == pytest.approx(spectra[0].observability, rel=within)
+    assert spectra[1].threshold == pytest.approx(spectra[0].threshold, rel=within)
+    # the unit of the Jacobian is metres of the gauge with the least noise
+    finest = min(noise.sigma for noise in one.values())
+    assert spectra[0].threshold == pytest.approx(finest, rel=within)
     findings = [  # setups of different legs are equally idealised
         [(f.kind, f.text) for f in find_fit_findings(c) if f.kind != "line assumed"] for c in found
     ]

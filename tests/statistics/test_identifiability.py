@@ -7,12 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibrated import plan_of, session_of
+from conftest import ROOT
 from gauges import exact
 from models import JOINTS
 
-from orthocal import Choice, calibrate, simulate_session
+from orthocal import Choice, calibrate, load_session, simulate_session
+from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
 from orthocal.errors import NotIdentifiableError, ParameterError
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.identifiability import (
@@ -230,3 +234,20 @@ def test_the_base_parameters_of_table_1_are_the_three_offsets(experiment_2):
     assert [p.value for p in base.free] == pytest.approx([p.value for p in paper.free], abs=1e-9)
     assert base.redundancy == 3
     assert full.redundancy == 0
+
+
+@pytest.mark.parametrize("model", ["offsets", "lengths"])
+def test_readings_that_determine_nuisance_parameters_check_nothing(model):
+    """Redundancy is tr(I − A (AᵀA + P)⁻¹ Aᵀ): A has columns of errors, mounting and gauge zeros."""
+    session = load_session(ROOT / "examples/linear_delta")  # ball bars: uncertain centre and length
+    fit = fit_problem(build_problem(session, model=model), options=SolverOptions(**QUICK))
+    problem, o = fit.problem, fit.problem.observations
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta, problem.active_passive)
+    a = np.hstack([jacobian / fit.sigma, problem.zero_incidence[:, ~o.zero_known]])
+    p = np.zeros(a.shape[1])
+    p[problem.n_machine : problem.n_free] = 1.0  # priors of nuisance parameters
+    hat = a @ np.linalg.solve(a.T @ a + np.diag(p), a.T)
+    calibration = assemble_calibration(fit)
+    # no reading of this session is repeated
+    assert calibration.redundancy == pytest.approx(o.size - np.trace(hat), rel=1e-9)
+    assert calibration.redundancy < fit.independent_readings - problem.n_machine - 1.0

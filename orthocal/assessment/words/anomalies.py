@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from orthocal.assessment.wording import (
     joined,
@@ -19,15 +16,23 @@ from orthocal.assessment.wording import (
     signed,
     um,
 )
-from orthocal.assessment.words.effects import identify_effects
+from orthocal.assessment.words.remedies import (
+    advise,
+    advise_about_sessions,
+    advise_effects,
+    advise_factor,
+    advise_repetition,
+    can_turn,
+    has_known_zero,
+)
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
-from orthocal.session.session import Reading, Session, split_label
-from orthocal.text import capitalised, printable, spans, uncapitalised
-from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM, Unit
+from orthocal.session.session import Session, split_label
+from orthocal.text import capitalised, spans, uncapitalised
+from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
 MAX_PLACES = 1000
 """Largest number of places in a finding, which limits the size of calibration.json."""
@@ -63,7 +68,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     text = _looks_as_if(session, anomaly, descriptions)
     if e.amounts:
         numbers["amount_um"] = (e.amount or 0.0) / UM
-        action = _effect_remedy(session, [a.explanation for a in result.found])
+        action = advise_effects(session, [a.explanation for a in result.found])
         return review(e.kind, text, action, _effect_places(session, e), **numbers)
     if e.kind in ("wrong dimension", "readjusted dimension"):
         numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
@@ -73,7 +78,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
             "expected_mm": anomaly.expected / MM,
             "cycle": float(first.cycle),
         }
-    action = _repeat(session, e) if anomaly.causes else _remedy(session, e)
+    action = advise_repetition(session, e) if anomaly.causes else advise(session, e)
     return review(e.kind, text, action, _places(session, e), **numbers)
 
 
@@ -112,13 +117,6 @@ def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
     return tuple(Place(parameter=name) for name, *_ in _significant_amounts(e))
 
 
-def _effect_remedy(session: Session, explanations: Iterable[Explanation]) -> str:
-    """Advice to calibrate with all missing effects in addition to those of the robot."""
-    missing = [e.effect for e in explanations if e.amounts]
-    robot = with_effects(session.robot, (*session.robot.effect_names, *missing))
-    return identify_effects(robot.effect_names)
-
-
 def _describe_effect(session: Session, name: str) -> str:
     """Description of an effect that the robot's model does not contain."""
     robot = with_effects(session.robot, (*session.robot.effect_names, name))
@@ -142,15 +140,15 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     explanations = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
     texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in explanations)
     listed = ";\n".join(texts)
-    action = _choose_factor(explanations) or _repeat(session, *explanations)
+    action = advise_factor(explanations) or advise_repetition(session, *explanations)
     reversed_setups = [e for e in explanations if e.kind == "reversed sign" and e.setups]
     if reversed_setups:  # nothing to read again
         names = tuple(n for e in reversed_setups for n in e.setups)
-        remedy = _remedy(session, replace(reversed_setups[0], setups=names))
+        remedy = advise(session, replace(reversed_setups[0], setups=names))
         only = len(reversed_setups) == len(explanations)
         action = remedy if only else f"{remedy} Otherwise {uncapitalised(action)}"
     if any(e.amounts for e in explanations):  # costs no reading
-        effect = _effect_remedy(session, explanations)
+        effect = advise_effects(session, explanations)
         repeat = uncapitalised(action)
         action = f"{effect} If the readings still contradict each other, {repeat}"
     return review(
@@ -205,7 +203,7 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     return review(
         e.kind,
         text,
-        _session_remedy(session, e),
+        advise_about_sessions(session, e),
         tuple(replace(place, parameter=name) for name in names) or (place,),
         **numbers,
     )
@@ -505,14 +503,8 @@ def _displaced_artefact(session: Session, e: Explanation) -> str:
     """Clause about a displaced artefact, such as a ball post, with its session."""
     label, artefact = split_label(e.names[0], joined=session.joined)
     name = f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
-    how = "displaced or turned over" if _can_turn(session, e) else "displaced"
+    how = "displaced or turned over" if can_turn(session, e) else "displaced"
     return f"{name} was {how} before setup {e.setups[0]}"
-
-
-def _can_turn(session: Session, e: Explanation) -> bool:
-    """True if an artefact has two sides: a square or a straightedge."""
-    _, artefact = split_label("".join(e.names[:1]), joined=session.joined)
-    return artefact.startswith(("square.", "straightedge."))
 
 
 def _dimensions_mm(e: Explanation) -> tuple[float, float]:
@@ -525,7 +517,7 @@ def _other_dimension(session: Session, e: Explanation) -> str:
     """Clause about a wrong dimension with its true and stated size."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
-    zeroed = f", or the dial was not zeroed at {stated:g} mm" * _has_known_zero(session, e)
+    zeroed = f", or the dial was not zeroed at {stated:g} mm" * has_known_zero(session, e)
     return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm{zeroed}"
 
 
@@ -534,13 +526,8 @@ def _readjusted(session: Session, e: Explanation) -> str:
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
     since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
-    zeroed = f", or the dial was not zeroed at {stated:g} mm" * _has_known_zero(session, e)
+    zeroed = f", or the dial was not zeroed at {stated:g} mm" * has_known_zero(session, e)
     return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm{zeroed}"
-
-
-def _has_known_zero(session: Session, e: Explanation) -> bool:
-    """True if a wrong dimension changes all readings as a wrong gauge zero does: bars."""
-    return any(session.setups[name].zero == "known" for name in e.setups)
 
 
 def _swapped(session: Session, e: Explanation) -> str:
@@ -633,171 +620,3 @@ def _compensated(session: Session, e: Explanation) -> str:
     if e.sessions:
         return f"in session {e.sessions[0]} {text}"
     return f"{text}, or the backlash is {size}"
-
-
-def _remedy(session: Session, e: Explanation) -> str:
-    """Action after an anomaly with one explanation."""
-    if e.scope == "reading" and (e.factor is not None or e.kind == "misread dial"):
-        stated = session.readings[e.rows[0]].value / MM
-        corrected = stated - (e.amount or 0.0) / MM if e.factor is None else stated * e.factor
-        return f"If so, write {corrected:+.6g} instead of {stated:+.6g}."
-    if e.kind == "reversed sign" and e.setups:
-        reverse_direction = ""
-        if all("direction" in session.setups[name].sensor.to_keys() for name in e.setups):
-            reverse_direction = (
-                " If the gauge pointed the other way, reverse `direction` of the setup."
-            )
-        return (
-            "Look at the mounting of the gauge. If a minus sign was forgotten, reverse the signs."
-            f"{reverse_direction}"
-        )
-    if e.factor is not None:
-        return f"If so, multiply these readings by {e.factor:.6g}."
-    if e.kind == "displaced gauge" and e.scope == "cycle":
-        return f"If so, read cycle {e.cycle} again, or leave it out."
-    if e.kind == "row offset":
-        if e.missing:
-            return "If so, move them down by a line and read what is missing."
-        return "If so, move them up by a line and read the last one again."
-    if e.kind == "displaced gauge" and session.firmware is not None:
-        return "If so, fasten the probe and the bed, probe again and import the new log."
-    if e.kind == "inconsistent posture" and e.scope == "postures":
-        return "Check its coordinates, and read it again."
-    zeroed = " If the dial was zeroed on the machine, state `zero: free` there."
-    zeroed *= _has_known_zero(session, e)
-    remedies = {
-        "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(session, e) else "")
-        + "If it was displaced, give it another name in the later setups.",
-        "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.{zeroed}",
-        "readjusted dimension": "If so, state the present "
-        f"`{''.join(e.names[:1])}` in that session. If it is unknown, give its gauge another name "
-        f"there.{zeroed}",
-        "inconsistent setup": "Check its leg, direction, section and the mounting of its gauge; "
-        "then read it again, or leave it out.",
-        "swapped rows": "If so, swap them back.",
-        "stuck dial": "Check that the plunger moves freely and touches, and read these again.",
-        "displaced gauge": _repeat_setup(session, e),
-        "drift": "Wait until machine and gauge have the same temperature, and return to the first "
-        "posture at the end of the setup. Or calibrate with `--effects "
-        f"{','.join((*session.robot.effect_names, 'drift'))}`.",
-    }
-    return remedies.get(e.kind) or _repeat(session, e)
-
-
-def _repeat_setup(session: Session, e: Explanation) -> str:
-    """Action after a displaced gauge."""
-    command = command_to_restart(session, session.readings[e.rows[0]])
-    divide = "make a new setup of the later readings."
-    return f"If so, read the setup again: {command}. Or {divide}" if command else f"If so, {divide}"
-
-
-def _repeat(session: Session, *explanations: Explanation) -> str:
-    """Action to repeat or omit readings, with commands for the first one."""
-    rows = [session.readings[i] for e in explanations for i in e.rows]
-    if session.firmware is not None:
-        repeat = "Clean the bed and the nozzle, probe again and import the new log"
-        if all(r.minus is not None for r in rows):
-            repeat = (
-                "Measure again and correct the command DELTA_ANALYZE, then import the log again"
-            )
-        lines = [r.line for r in rows if r.line is not None]
-        omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
-        return f"{repeat}. Or {omitted}, and calibrate again."
-    what = "it" if len(rows) == 1 else "these"
-    file = rows[0].file or session.readings_path
-    if file is None or rows[0].line is None:
-        return f"Read {what} again, or leave out what is wrong."
-    line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
-    others = ""
-    if further := {r.line or 0 for r in rows} - {line}:
-        one_file = len({r.file for r in rows}) == 1
-        named = spans(sorted(further), "line") if one_file else "the other lines"
-        others = f", likewise {named}"
-    correct = f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
-    if not all(_has_present_offsets(session, r) for r in rows):
-        return (
-            f"Do not read {what} again, because other offsets are active now. Compare with your "
-            f"notes: in `orthocal record {path}` {correct}"
-        )
-    moved = ""
-    displaced = any(e.kind == "displaced gauge" for e in explanations)
-    if displaced or any(r.setup != session.readings[-1].setup for r in rows):
-        moved = (
-            f" If the gauge has been moved since, type `restart {line}`: it reads the setup again."
-        )
-    return (
-        f"Read {what} again: in `orthocal record {path}` type `repeat {line}`{others}.{moved} "
-        f"{correct}"
-    )
-
-
-def _has_present_offsets(session: Session, reading: Reading) -> bool:
-    """True if the controller had the offsets of the last reading, so that it can be read again."""
-    present = session.active_during(session.readings[-1].setup)
-    return bool(np.array_equal(session.active_during(reading.setup), present))
-
-
-def command_to_restart(session: Session, reading: Reading) -> str:
-    """Clause with the command that reads the setup of a reading again.
-
-    Empty if other offsets are active now, or if the reading is not in a file.
-    """
-    file = reading.file or session.readings_path
-    if file is None or reading.line is None or not _has_present_offsets(session, reading):
-        return ""
-    path = printable(shlex.quote(str(file.parent)))
-    return f"in `orthocal record {path}` type `restart {reading.line}`"
-
-
-def _choose_factor(explanations: Sequence[Explanation]) -> str:
-    """Action if only the unit of several readings is in question; otherwise ""."""
-    rows = explanations[0].rows
-    factors = [e.factor for e in explanations if (e.factor or 0.0) > 0.0 and e.rows == rows]
-    if len(rows) < 2 or len(factors) < len(explanations):
-        return ""
-    return (
-        "Take one of these readings again. It shows by which factor all of them are too small or "
-        f"too large: multiply them by {joined([f'{f:.6g}' for f in factors], 'or')}."
-    )
-
-
-def _session_remedy(session: Session, e: Explanation) -> str:
-    """Action for numbers that were entered wrongly, or a change between sessions."""
-    if session.firmware is not None:
-        return (
-            "Calibrate the last log alone and export its settings: they must belong to the present "
-            "printer."
-        )
-    if e.kind == "lost steps":
-        return (
-            "Home the machine, go to the first posture of a setup and read it again. If it has "
-            f"changed, look for the cause at {joined(e.drives)}, and measure the session again."
-        )
-    if e.kind != "machine changed":
-        number = "backlash" if e.kind.startswith("backlash") else "offsets"
-        key = f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
-        which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
-        by_factor = e.kind in ("backlash halved", "backlash entered twice")
-        complete = " LinuxCNC's BACKLASH is the complete backlash." * by_factor
-        return (
-            f"Compare the {number} in the controller with `{key}` of {which}.{complete} If the "
-            "session states wrong numbers, correct them there; otherwise enter the right ones and "
-            "measure again."
-        )
-    first = e.sessions[0]
-    if e.apart:
-        first = f"{joined(e.sessions)} and the others"
-        return (
-            f"Make sure that the sessions state when they were measured. Calibrate {first} apart."
-        )
-    calibrate_apart = (
-        f"Calibrate session {first} and later ones without the earlier ones: the values to enter "
-        "must belong to the present machine."
-    )
-    if not e.drives:
-        return calibrate_apart
-    return (
-        "First make sure that all sessions state the active offsets (`controller.offsets_mm`): "
-        "offsets entered in between look the same. Otherwise: "
-        f"{uncapitalised(calibrate_apart)}"
-    )

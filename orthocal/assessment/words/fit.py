@@ -131,12 +131,19 @@ def gauge_overstated(sigma: float, stated: float, of_gauge: str) -> Finding:
     )
 
 
-def no_redundancy(readings: int, parameters: int) -> Finding:
-    """Finding that the fit has no redundant readings."""
+def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
+    """Finding that the fit has no redundant readings.
+
+    Args:
+        readings: Number of independent readings.
+        parameters: Number of free errors of the machine.
+        mounting: True if further readings determine only the mounting of gauges.
+    """
+    further = " and the mounting of the gauges" if mounting else ""
     return note(
         "no redundancy",
-        f"There are {readings} independent readings for {parameters} possible errors, so the "
-        "result relies on the stated tolerances. Only new readings can check it.",
+        f"There are {readings} independent readings for {parameters} possible errors{further}, so "
+        "the result relies on the stated tolerances. Only new readings can check it.",
         independent_readings=float(readings),
         parameters=float(parameters),
     )

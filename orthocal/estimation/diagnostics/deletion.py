@@ -26,7 +26,7 @@ import numpy as np
 from orthocal.arrays import Array, Indices
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.fit import Fit, require_determined
-from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA
 from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.information import Information, decompose

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.estimation.weighting import ROUNDING_ERROR, usual_difference
 from orthocal.hypotheses.anomaly import Explanation, Scope
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, group_rows, sparse_rows
+from orthocal.observation.gauge_noise import ROUNDING_ERROR, usual_difference
 from orthocal.session.session import Gauge
 
 MAX_ROWS_FOR_ALL_PAIRS = 400

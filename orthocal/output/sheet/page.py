@@ -11,7 +11,6 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
 from orthocal.effects.compensation import describe_trims
-from orthocal.estimation.weighting import usual_difference
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import approach_length, describe_approach
@@ -25,6 +24,7 @@ from orthocal.measurement.motion.motion import (
 )
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.observation.conditions import needed_conditions
+from orthocal.observation.gauge_noise import usual_difference
 from orthocal.output.sheet.gauge_position import (
     ABOUT_ALONG,
     GaugePosition,

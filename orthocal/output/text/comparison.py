@@ -104,7 +104,7 @@ def _scores(comparison: Comparison) -> RenderableType:
     chosen = comparison.recommendation
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
-        checked = result.redundancy > 0
+        checked = result.calibration.is_checked
         evidence = math.nan if chosen is None else chosen.log_evidence_of(result.model)
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"

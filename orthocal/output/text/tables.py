@@ -149,7 +149,6 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     """Identifiable combinations of parameters, and inseparable parameters."""
     spectrum, base = calibration.identifiability, calibration.base
     count = spectrum.singular_values.size
-    spare = calibration.redundancy
     threshold = f"{spectrum.threshold / UM:.3g} µm per prior standard deviation"
     if base:
         lines = [
@@ -161,9 +160,11 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
             f"Rank {spectrum.rank} of {count}: combinations of parameters with singular values "
             f"above the noise ({threshold}). Rank without noise: {spectrum.structural_rank}."
         ]
+    nuisance, checks = round(spectrum.n_nuisance, 1), round(calibration.redundancy, 1)
+    of_sensors = f", {nuisance:g} the nuisance parameters of the gauges" if nuisance else ""
     lines.append(
-        f"{counted(spectrum.n_readings, 'independent reading')}: {spectrum.n_readings - spare} "
-        f"determine the parameters, {spare or 'none'} check the model."
+        f"{counted(spectrum.n_readings, 'independent reading')}: {calibration.rank} determine the "
+        f"errors of the machine{of_sensors}, {f'{checks:g}' if checks else 'none'} check the model."
     )
     if spectrum.rank:
         o = spectrum.observability
