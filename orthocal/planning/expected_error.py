@@ -181,7 +181,7 @@ class ToolForecast:
         self,
         session: Session,
         *,
-        weight: float | None = None,
+        weights: Array | None = None,
         entered: bool = True,
         machines: Sequence[Array] | None = None,
     ) -> Expected:
@@ -193,8 +193,8 @@ class ToolForecast:
 
         Args:
             session: Setups and postures; the values of the readings are not used.
-            weight: Standard deviation that weights the readings, [m]; by default that of the gauge.
-                It is larger if the model omits errors.
+            weights: Standard deviations that weight the readings, shape (n_entries,), [m]; by
+                default those of the gauges. They are larger if the model omits errors.
             entered: True if identified offsets were entered before and the remaining ones are
                 small; False to draw offsets from their priors.
             machines: Machines instead of drawn ones: free parameters of the session's problem,
@@ -205,7 +205,6 @@ class ToolForecast:
         """
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = stated_sigma(session.gauge)
         drawn = self._draw(problem, entered=entered) if machines is None else machines
         theta = np.array(list(drawn))
         _, passive, reached = problem.simulate(theta)
@@ -221,7 +220,7 @@ class ToolForecast:
                 jacobians.update(zip(closed.tolist(), of_closed, strict=True))
             for i in block[~reached[block]].tolist():
                 jacobians[i] = _jacobian_or_none(problem, theta[i])
-            return [self._posterior(problem, others, j, noise, weight) for j in jacobians.values()]
+            return [self._posterior(problem, others, j, weights) for j in jacobians.values()]
 
         results = [
             result
@@ -240,9 +239,8 @@ class ToolForecast:
         """Expected tool error to first order about the nominal machine, as in the search."""
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = stated_sigma(session.gauge)
         jacobian = _jacobian_or_none(problem, problem.active_theta)
-        covariance, _ = self._posterior(problem, others, jacobian, noise)
+        covariance, _ = self._posterior(problem, others, jacobian)
         if covariance is None:
             raise ClosureError("cannot be read", posture="the planned ones")
         return self._expected(covariance)
@@ -281,8 +279,7 @@ class ToolForecast:
         problem: CalibrationProblem,
         others: Array | None,
         jacobian: Array | None,
-        noise: float,
-        weight: float | None = None,
+        weights: Array | None = None,
     ) -> tuple[Array | None, float]:
         """Covariance of the errors of the estimate about a machine.
 
@@ -291,8 +288,7 @@ class ToolForecast:
             others: Jacobian of unmodelled errors, shape (n_entries, n_others), [m per prior std].
             jacobian: Jacobian of the readings about the machine, shape (n_entries, n_free), [m per
                 prior std]; None if the machine does not reach the postures.
-            noise: Standard deviation of a reading, [m].
-            weight: Standard deviation that weights the readings, [m]; by default `noise`.
+            weights: As in `after`; equal for readings with a common zero.
 
         Returns:
             The covariance, shape (n_names, n_names), [SI], or None if too few readings are
@@ -305,21 +301,22 @@ class ToolForecast:
         lost = 1.0 - float(possible.mean())
         if possible.sum() <= o.n_free_zeros:
             return None, lost
-        o = o.only(possible)
+        o, noise = o.only(possible), stated_sigma(problem.session.gauge)
+        excess = np.ones((o.size, 1))  # weighting standard deviations, divided by those of noise
+        if weights is not None:
+            excess = (weights / (noise * problem.noise_ratio))[possible, None]
         precision = np.maximum(problem.prior_precision, VAGUE)
-        weight = noise if weight is None else weight
-        jacobian = project_out_zeros(jacobian[possible], o)
-        inverse = Information(jacobian).posterior(sigma=weight, precision=precision).covariance
+        jacobian = project_out_zeros(jacobian[possible], o) / excess
+        inverse = Information(jacobian).posterior(sigma=noise, precision=precision).covariance
         scale = problem.theta_scale[:n]
-        covariance = inverse
-        if weight != noise:  # the scatter of the readings is smaller than their weight implies
-            gain = inverse @ jacobian.T
-            covariance = inverse - (weight**2 - noise**2) / weight**4 * (gain @ gain.T)
+        # the scatter of the readings is smaller than their weights imply
+        gain = inverse @ jacobian.T / noise
+        covariance = inverse - gain * (1.0 - excess.T**-2) @ gain.T
         identified = covariance[:n, :n] * np.outer(scale, scale)
         if others is None:
             return identified, lost
-        others = project_out_zeros(others[possible], o)
-        bias = (inverse @ (jacobian.T @ others) / weight**2)[:n] * scale[:, None]
+        others = project_out_zeros(others[possible], o) / excess
+        bias = (inverse @ (jacobian.T @ others) / noise**2)[:n] * scale[:, None]
         variance = np.diag(self.prior_stds[n:] ** 2)
         cross = bias * self.prior_stds[n:]
         return np.block([[identified + bias @ bias.T, -cross], [-cross.T, variance]]), lost

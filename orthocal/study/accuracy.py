@@ -148,7 +148,7 @@ class AccuracyStudy(Study):
         names = forecast.problem(session).free
         count = min(PREDICTED_MACHINES, self.machines)
         machines = [prepared.true_values(number, names) for number in range(count)]
-        return forecast.after(session, weight=prepared.model.sigma, machines=machines)
+        return forecast.after(session, weights=prepared.model.weights, machines=machines)
 
 
 def build_accuracy_study(
