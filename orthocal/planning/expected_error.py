@@ -33,12 +33,12 @@ from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_groups import OF_GAUGE
+from orthocal.observation.sensor_groups import shared_gauge_parameters
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import is_offset
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
-from orthocal.statistics.information import VAGUE, Information
+from orthocal.statistics.information import VAGUE, Information, decompose, marginalise
 from orthocal.statistics.noise import estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -164,18 +164,38 @@ class ToolForecast:
     ) -> Array:
         """Inverse covariance of the state from its priors and from existing readings.
 
-        The shape is (n_state, n_state), in units of the prior standard deviations.
+        The existing readings determine errors of the machine and of gauges that are used again. All
+        their other parameters are marginalised. They include the positions of fixed balls and
+        instruments, which further readings do not share.
 
         Args:
             problem: Problem whose free parameters include the state.
             state: Names of the parameters of the state.
             measured: Existing readings.
+
+        Returns:
+            Shape (n_state, n_state), in units of the prior standard deviations of `problem`.
         """
         index = [problem.free.index(name) for name in state]
-        prior = np.diag(np.maximum(problem.prior_precision[index], VAGUE))
+        precision = np.maximum(problem.prior_precision[index], VAGUE)
         if measured is None:
-            return np.asarray(prior)
-        return np.asarray(prior + _information(self.problem(measured), state, measured))
+            return np.diag(precision)
+        existing = self.problem(measured)
+        shared = {name: name for name in self.selection.names}
+        shared |= shared_gauge_parameters(problem.session, measured)
+        known = [i for i, name in enumerate(state) if name in shared]
+        columns = [existing.free.index(shared[state[i]]) for i in known]
+        scale = problem.theta_scale[index][known] / existing.theta_scale[columns]
+        # joined sessions have the prior that the first of them states
+        precision[known] = np.maximum(existing.prior_precision[columns], VAGUE) * scale**2
+        others = [i for i in range(existing.n_free) if i not in columns]
+        _, jacobian = existing.predict_and_jacobian(existing.active_theta)
+        information = decompose(jacobian[:, columns + others], existing.observations)
+        sigma = stated_sigma(measured.gauge)
+        rows = marginalise(information, len(columns), sigma=sigma).factor * scale / sigma
+        result = np.diag(precision)
+        result[np.ix_(known, known)] += rows.T @ rows
+        return result
 
     def after(
         self,
@@ -401,35 +421,6 @@ def _root(rows: Array) -> Array:
     values, vectors = np.linalg.eigh(rows.T @ rows)
     positive = values > values[-1] * 1e-14
     return np.asarray(vectors[:, positive] * np.sqrt(values[positive]))
-
-
-def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
-    """Information of a session about the state, shape (n_state, n_state).
-
-    All other parameters of the session are marginalised. They include the positions of its fixed
-    balls and instruments, which further readings do not share.
-    """
-    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
-    jacobian = project_out_zeros(jacobian, problem.observations)
-    information = jacobian.T @ jacobian / stated_sigma(measured.gauge) ** 2
-    lasting = {
-        name
-        for i, name in enumerate(problem.free)
-        if name in state and (i < problem.n_machine or name.startswith(OF_GAUGE))
-    }
-    others = [i for i, name in enumerate(problem.free) if name not in lasting]
-    columns = [problem.free.index(name) for name in state if name in lasting]
-    places = [i for i, name in enumerate(state) if name in lasting]
-    of_others = information[np.ix_(others, others)] + np.diag(
-        np.maximum(problem.prior_precision[others], VAGUE)
-    )
-    cross = information[np.ix_(columns, others)]
-    marginal = information[np.ix_(columns, columns)]
-    if others:
-        marginal = marginal - cross @ np.linalg.solve(of_others, cross.T)
-    of_state = np.zeros((len(state), len(state)))
-    of_state[np.ix_(places, places)] = marginal
-    return of_state
 
 
 def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
