@@ -20,7 +20,7 @@ from orthocal.observation.observations import drive_table
 from orthocal.planning.equipment import place_tool
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
-from orthocal.session.session import Gauge, Reading, Session, describe_postures
+from orthocal.session.session import Conditions, Gauge, Reading, Session, describe_postures
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
@@ -99,8 +99,8 @@ def build_sensitivity_study(
     Args:
         source: A robot of Orthoglide type, measured by the paper's plan; or a session of any robot.
         free: Names or globs of the errors; default: all that affect a reading or the tool.
-        points: Tool positions at which every setup is read in place of its postures: commanded
-            coordinates, shape (K, n_coordinates), [m].
+        points: Tool positions at which every setup is read in place of its postures, with each of
+            its approaches: commanded coordinates, shape (K, n_coordinates), [m].
         displacements: Displacements of the paper's postures.
 
     Raises:
@@ -123,7 +123,10 @@ def build_sensitivity_study(
 
 
 def _at_points(session: Session, points: Array) -> Session:
-    """Session in which every setup is read at every tool position."""
+    """Session in which every setup is read at every tool position, from each side of approach.
+
+    Conditions are those of the first reading of the setup with the same approach.
+    """
     names = [f"point_{i + 1}" for i in range(len(points))]
     postures_at_points = place_tool(session.robot, names, points)
     postures = {
@@ -133,7 +136,15 @@ def _at_points(session: Session, points: Array) -> Session:
     aligned_at = session.alignment_postures
     setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
     alignment = {n: session.postures[n] for n in aligned_at.values()}
-    readings = tuple(Reading(setup, posture) for setup in setups for posture in postures)
+    conditions: dict[str, dict[str | None, Conditions | None]] = {name: {} for name in setups}
+    for r in session.readings:
+        conditions[r.setup].setdefault(r.approach, r.conditions)
+    readings = tuple(
+        Reading(setup, posture, conditions=stated)
+        for setup, by_approach in conditions.items()
+        for posture in postures
+        for stated in (by_approach.values() or (None,))
+    )
     postures = {**postures, **alignment}
     session_at_points = replace(session, setups=setups, postures=postures, readings=readings)
     check_contacts(session_at_points)
