@@ -257,13 +257,7 @@ class ToolForecast:
 
     def about_nominal(self, session: Session) -> Expected:
         """Expected tool error to first order about the nominal machine, as in the search."""
-        problem = self.problem(session)
-        others = self._jacobian_of_others(session)
-        jacobian = _jacobian_or_none(problem, problem.active_theta)
-        covariance, _ = self._posterior(problem, others, jacobian)
-        if covariance is None:
-            raise ClosureError("cannot be read", posture="the planned ones")
-        return self._expected(covariance)
+        return self.after(session, machines=[self.problem(session).active_theta])
 
     def _jacobian_of_others(self, session: Session) -> Array | None:
         """Change of a session's readings by one prior std of each unmodelled error.
@@ -449,10 +443,9 @@ def state_noise(session: Session) -> Session:
         values = o.values(session.values)[group.entries]
         sigma, dof = estimate_repeatability(values, o.only(group.entries))
         if not (dof and sigma > 0.0):
-            key = f"gauges.{group.name}.sigma_mm" if group.name else "gauge.sigma_mm"
             raise SessionError(
                 "is missing; a plan needs the repeatability of the readings",
-                where=key if session.path is None else f"{session.path}: {key}",
+                where=session.locate_gauge_key(group.name, "sigma_mm"),
             )
         gauges[group.name] = replace(group.gauge, sigma=sigma)
     return replace(session, gauges=gauges)

@@ -32,8 +32,6 @@ class Pairs:
     """First reading of each pair, shape (n_pairs,)."""
     second: Indices
     """Second reading of each pair, shape (n_pairs,)."""
-    flat: Indices
-    """Index of each pair in a flattened matrix of shape (m, m), shape (n_pairs,)."""
     within_range: Indices
     """Number of readings within the gauge's range if the setup begins in each reading, (m,)."""
 
@@ -42,16 +40,15 @@ class Pairs:
         """All pairs within the gauge's range."""
         allowed = setup.reachable.copy()
         np.fill_diagonal(allowed, False)
-        flat = np.flatnonzero(allowed)
-        first, second = np.divmod(flat, len(allowed))
-        return Pairs(first, second, flat, setup.reachable.sum(axis=1))
+        first, second = np.nonzero(allowed)
+        return Pairs(first, second, setup.reachable.sum(axis=1))
 
     def with_count(self, count: int) -> Pairs:
         """Pairs whose first reading has at least `count` readings within the gauge's range."""
         if (self.within_range >= count).all():
             return self
         enough = self.within_range[self.first] >= count
-        return Pairs(self.first[enough], self.second[enough], self.flat[enough], self.within_range)
+        return Pairs(self.first[enough], self.second[enough], self.within_range)
 
 
 def pair_gains(product: Array, spread: Array, noise: float, *, absolute: bool) -> Array:
@@ -370,7 +367,7 @@ class PointGain:
             count: Largest number of pairs.
         """
         allowed = np.zeros_like(self.setup.reachable)
-        allowed.reshape(-1)[pairs.flat] = True
+        allowed[pairs.first, pairs.second] = True
         blocks = self.effect.reshape(len(allowed), -1, self.effect.shape[1])
         gains = self._trace(np.einsum("ibr,icr->ibc", blocks, blocks), self._blocks(self.spread))
         ranked: list[tuple[float, tuple[int, int]]] = []

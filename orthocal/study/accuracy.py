@@ -216,10 +216,9 @@ def _require_noise(session: Session) -> None:
     """Refuse a session with a gauge whose noise is not stated."""
     for name, gauge in session.gauges.items():
         if gauge.sigma is None:
-            key = f"gauges.{name}.sigma_mm" if name else "gauge.sigma_mm"
             raise SessionError(
                 "is missing: the study needs the noise of the gauge",
-                where=key if session.path is None else f"{session.path}: {key}",
+                where=session.locate_gauge_key(name, "sigma_mm"),
             )
 
 

@@ -37,6 +37,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.study.random_machines import NO_CONTACT, NOT_ASSEMBLED
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once, require_counts
 from orthocal.units import MM
@@ -44,8 +45,6 @@ from orthocal.units import MM
 Flags = NDArray[np.bool_]
 
 IDENTIFIED = "identified"
-NOT_ASSEMBLED = "cannot be assembled"
-NO_CONTACT = "a tip misses the part it should touch"
 
 MAX_STEPS = 20
 """Largest number of undamped Gauss-Newton steps."""

@@ -72,18 +72,14 @@ class SensitivityStudy(Study):
             key = posture, setups[observations.setup[i]]
             changes_by_output.setdefault(key, jacobian[i] * problem.noise_ratio[i])
         scales = np.array([p.prior_std * p.edge_factor for p in parameters])
-        n = len(changes_by_output)
+        n, changes = len(changes_by_output), np.array(list(changes_by_output.values()))
         return {
             "posture": [posture for posture, _ in changes_by_output for _ in parameters],
             "output": [output for _, output in changes_by_output for _ in parameters],
             "parameter": [p.name for p in parameters] * n,
-            "derivative": [
-                v for row in changes_by_output.values() for v in (row / MM / scales).tolist()
-            ],
+            "derivative": (changes / MM / scales).ravel().tolist(),
             "unit": [f"mm/{p.edge_unit}" for p in parameters] * n,
-            "um_per_prior_std": [
-                v for row in changes_by_output.values() for v in (row / UM).tolist()
-            ],
+            "um_per_prior_std": (changes / UM).ravel().tolist(),
         }
 
 

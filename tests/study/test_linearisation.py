@@ -19,10 +19,10 @@ from orthocal.session.session import Gauge
 from orthocal.study.linearisation import (
     IDENTIFIED,
     METHODS,
-    NO_CONTACT,
     build_linearisation_study,
     summarise_linearisation,
 )
+from orthocal.study.random_machines import NO_CONTACT
 from orthocal.study.runner import run_study
 from orthocal.study.study import run_task
 
