@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from orthocal.arrays import Array, Indices
+from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.tool_error import (
     ErrorStatistics,
     ToolErrorStatistics,
@@ -158,6 +159,10 @@ class ToolForecast:
     def problem(self, session: Session) -> CalibrationProblem:
         """Calibration problem of a session's readings."""
         return with_gauge_noise(CalibrationProblem(session, self.selection))
+
+    def limits(self, session: Session) -> tuple[EffectLimits, ...]:
+        """Limits of the effects beside geometry, before and after a session's readings."""
+        return find_limits(self.problem(session), stated_sigma(session.gauge))
 
     def prior_information(
         self, problem: CalibrationProblem, state: Sequence[str], measured: Session | None
