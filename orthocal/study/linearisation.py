@@ -100,6 +100,8 @@ class LinearisationStudy(Study):
                 "exact sensors, which only indicators support",
                 where="sensors",
             )
+        if all(stated_sigma(g) > 0.0 for g in self.session.gauges_with_readings.values()):
+            problem = with_gauge_noise(problem)  # readings are weighted as in a calibration
         linearisation = linearise_problem(problem)
         require_determined(problem, linearisation.information)
         matrices, differences = {}, np.zeros((0, problem.observations.size))
@@ -186,7 +188,8 @@ class _Prepared:
             add(f"steps_{k + 2}", theta)
         add("exact", exact)
         linear = errors / problem.theta_scale @ self.linearisation.jacobian.T
-        nonlinearity = _largest_difference(centred - linear, problem) / MM
+        nonlinear = (centred - linear) * problem.noise_ratio
+        nonlinearity = _largest_difference(nonlinear, problem) / MM
         reason = np.where(assembled, NO_CONTACT, NOT_ASSEMBLED)
         return {
             "status": np.where(measurable, IDENTIFIED, reason).tolist(),
@@ -268,10 +271,7 @@ class _Prepared:
                 whiten = np.linalg.inv(np.linalg.cholesky(covariance))
             solution = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
             errors[name] = sigma * float(np.sqrt((solution**2).sum(axis=1).max()))
-        noise = np.ones(self.problem.observations.size)
-        if all(stated_sigma(g) > 0.0 for g in self.problem.session.gauges_with_readings.values()):
-            noise = with_gauge_noise(self.problem).noise_ratio
-        jacobian = self.linearisation.jacobian / noise[:, None] / self.problem.theta_scale
+        jacobian = self.linearisation.jacobian / self.problem.theta_scale
         variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
         general = sigma * float(np.sqrt(variances.max()))
         return {**errors, **dict.fromkeys(METHODS[3:], general)}
