@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -244,7 +245,8 @@ class ToolForecast:
                 _, of_closed = problem.predict_and_jacobian(theta[closed], passive[closed])
                 jacobians.update(zip(closed.tolist(), of_closed, strict=True))
             for i in block[~reached[block]].tolist():
-                jacobians[i] = _jacobian_or_none(problem, theta[i])
+                with suppress(ClosureError):
+                    jacobians[i] = problem.predict_and_jacobian(theta[i])[1]
             return [self._posterior(problem, others, j, weights) for j in jacobians.values()]
 
         results = [
@@ -405,14 +407,6 @@ class CriterionWeight:
         weights = share * total ** (1.0 / WORST_POWER - 1.0) / len(share)
         flat = np.sqrt(weights)[:, None, None] * self._field
         return _root(flat.reshape(-1, flat.shape[2]))
-
-
-def _jacobian_or_none(problem: CalibrationProblem, theta: Array) -> Array | None:
-    """Identification Jacobian about a machine; None if it cannot reach a posture."""
-    try:
-        return problem.predict_and_jacobian(theta)[1]
-    except ClosureError:
-        return None
 
 
 def _root(rows: Array) -> Array:

@@ -178,7 +178,7 @@ class SetupGain:
         −w wᵀ / w_p. Residual effects and variances of all readings change by one product each.
         """
         spread = self.spread[rows]
-        covariance = self._covariance(spread, rows)
+        covariance = spread[:, rows] + self.noise * np.eye(len(rows))
         inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         in_zero, of_zero = np.zeros(len(rows)), 0.0
         if not self.setup.absolute:
@@ -270,7 +270,7 @@ class SetupGain:
         for k in range(len(gains), count):
             if k >= len(chosen):
                 excluded[chosen] = True
-                single = self._single_gains(effect, variance)
+                single = np.vecdot(effect, effect) / (np.maximum(variance, 0.0) + self.noise)
                 np.putmask(single, excluded, -1.0)
                 best = first_largest(single)
                 if excluded[best]:
@@ -287,18 +287,6 @@ class SetupGain:
             effect = np.subtract(effect, change, out=None if effect is self.effect else effect)
             variance = variance - column**2
         return tuple(gains), tuple(chosen)
-
-    def _covariance(self, spread_rows: Array, rows: list[int]) -> Array:
-        """V_SS + σ² I of readings, from their rows of V."""
-        covariance = spread_rows[:, rows]
-        covariance[np.diag_indices(len(rows))] += self.noise
-        return covariance
-
-    def _single_gains(self, effect: Array, variance: Array) -> Array:
-        """Gain of each reading alone, shape (m,)."""
-        scale = np.maximum(variance, 0.0)
-        scale += self.noise
-        return np.asarray(np.vecdot(effect, effect) / scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -70,7 +70,7 @@ class AccuracyStudy(Study):
 
     def prepare(self) -> RandomMachines:
         """Random machines, the models that identify them, and the workspace."""
-        session = self._session_of_machines
+        session = self.session.with_effects(self.effects)
         models = [(self.session, self.choice)]
         if self.ignored:
             models.append((self._session_with_ignored, replace(self.choice, effects=None)))
@@ -82,11 +82,6 @@ class AccuracyStudy(Study):
             seed=self.seed,
             count=self.machines,
         )
-
-    @property
-    def _session_of_machines(self) -> Session:
-        """Plan with the effects of the machines."""
-        return self.session.with_effects(self.effects)
 
     @property
     def _session_with_ignored(self) -> Session:
