@@ -14,9 +14,9 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
-from orthocal.observation.observations import drive_table
 from orthocal.planning.equipment import place_tool
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
@@ -53,23 +53,13 @@ class SensitivityStudy(Study):
         setups, postures = list(session.setups), list(session.postures)
         parameters = problem.machine_selection.parameters
         jacobian = problem.predict_and_jacobian(problem.active_theta)[1][:, : len(parameters)]
-        changes_by_output: dict[tuple[str, str], Array] = {}
-        postures_read = {postures[i] for i in observations.posture}
-        if session.robot.tcp is not None:
-            tool = ToolSensitivity(session.robot, free=problem.machine_selection.names)
-            tool_jacobian = tool(drive_table(session), names=postures)
-            tool_changes = tool_jacobian * problem.theta_scale[: len(parameters)]
-            for posture, rows in zip(postures, tool_changes, strict=True):
-                if posture in postures_read:
-                    changes_by_output.update(
-                        {(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)}
-                    )
-        approaches = dict(zip(observations.plus.tolist(), session.readings, strict=True))
-        for i in range(observations.size):
-            reading = approaches.get(i)
-            approach = None if reading is None else reading.approach
-            posture = describe_postures(postures[observations.posture[i]], None, approach)
-            key = posture, setups[observations.setup[i]]
+        approach_of = {
+            i: r.approach for i, r in zip(observations.plus.tolist(), session.readings, strict=True)
+        }
+        places = [(postures[k], approach_of.get(i)) for i, k in enumerate(observations.posture)]
+        changes_by_output = {} if session.robot.tcp is None else _tool_changes(problem, places)
+        for i, (posture, approach) in enumerate(places):
+            key = describe_postures(posture, None, approach), setups[observations.setup[i]]
             changes_by_output.setdefault(key, jacobian[i] * problem.noise_ratio[i])
         scales = np.array([p.prior_std * p.edge_factor for p in parameters])
         n, changes = len(changes_by_output), np.array(list(changes_by_output.values()))
@@ -81,6 +71,32 @@ class SensitivityStudy(Study):
             "unit": [f"mm/{p.edge_unit}" for p in parameters] * n,
             "um_per_prior_std": (changes / UM).ravel().tolist(),
         }
+
+
+def _tool_changes(
+    problem: CalibrationProblem, places: Sequence[tuple[str, str | None]]
+) -> dict[tuple[str, str], Array]:
+    """Changes of tool coordinates by one prior standard deviation of each error, [m].
+
+    Args:
+        problem: The problem.
+        places: Postures and approaches; the tool is at the reference temperature.
+
+    Returns:
+        Posture in words and coordinate, mapped to shape (n_machine,).
+    """
+    session, selection = problem.session, problem.machine_selection
+    result = {}
+    for approach in dict.fromkeys(a for _, a in places):
+        names = list(dict.fromkeys(n for n, a in places if a == approach))
+        drives = np.array([session.postures[n].drives for n in names])
+        conditions = UseConditions(approach=approach)
+        tool = ToolSensitivity(session.robot, free=selection.names, conditions=conditions)
+        for name, changes in zip(names, tool(drives, names=names), strict=True):
+            label = describe_postures(name, None, approach)
+            for axis, change in zip(TOOL, changes * selection.prior_stds, strict=True):
+                result[label, axis] = change
+    return result
 
 
 def build_sensitivity_study(

@@ -54,6 +54,14 @@ def test_points_are_read_with_the_conditions_of_each_setup():
         other = row(found, f"point_1 (approach {opposite})", "yx")
         # the temperatures differ by some kelvins, lengths by some 1e-5
         assert one[backlash] == pytest.approx(-other[backlash], rel=1e-4)
+        tools = [
+            [row(found, f"point_1 (approach {a})", f"tool {axis}")[backlash] for axis in "xyz"]
+            for a in (approach, opposite)
+        ]
+        assert tools[0] == pytest.approx(-np.array(tools[1]))
+        # a drive stops short by half of its backlash, and moves the tool along its axis
+        sides = [0.5 if letter == "n" else -0.5 for letter in approach]
+        assert np.diagonal(tools[0]) == pytest.approx(sides)
         assert np.abs(one[backlash]).max() > 0.1
         assert (one[expansion] == 0.0) == (conditions.temperature == 20.0)
 
