@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +91,31 @@ def nominal_values(session: Session) -> dict[str, float]:
         for p in setup.sensor.nuisance_parameters
         if p.nominal
     }
+
+
+def shared_gauge_parameters(session: Session, measured: Session) -> dict[str, str]:
+    """Parameters of gauges that a session shares with existing readings that it is joined with.
+
+    Returns:
+        Name in the session to name in the existing readings.
+    """
+    existing = dict(_gauge_parameters(measured))
+    return {name: existing[key] for key, name in _gauge_parameters(session) if key in existing}
+
+
+def _gauge_parameters(session: Session) -> Iterator[tuple[tuple[str, str, float], str]]:
+    """Parameters of the gauges with readings.
+
+    Yields:
+        Gauge, parameter and nominal value, which are equal for all sessions that share the
+        parameter; and its name in the session.
+    """
+    read = {r.setup for r in session.readings}
+    for setup in session.setups.values():
+        _, gauge = split_label(setup.gauge, joined=session.joined)
+        for p in setup.sensor.nuisance_parameters:
+            if p.of_gauge and setup.name in read:
+                yield (gauge, p.name, p.nominal), f"{_owner(p, setup, session)}.{p.name}"
 
 
 def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:

@@ -171,7 +171,7 @@ def _require_readable(plan: Session, rows: Array) -> None:
                 f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
                 f"range ends at {limit / MM:g} mm. Such a machine needs a gauge with more range, "
                 "or offsets that are entered before; use smaller errors or another seed",
-                where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
+                where=plan.locate_gauge_key(gauge_name, "range_mm"),
             )
 
 
@@ -235,15 +235,9 @@ def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> fl
     if noise is None and not exact:
         raise SessionError(
             "is missing: the noise to simulate is not stated",
-            where=_where(plan, gauge, "sigma_mm"),
+            where=plan.locate_gauge_key(gauge, "sigma_mm"),
         )
     return noise or 0.0
-
-
-def _where(plan: Session, gauge: str, key: str) -> str:
-    """File and key of a gauge, for messages."""
-    path = f"gauges.{gauge}.{key}" if gauge else f"gauge.{key}"
-    return path if plan.path is None else f"{plan.path}: {path}"
 
 
 class _TruthKeys(Keys):

@@ -19,7 +19,7 @@ from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.motion.approach import can_approach, usual_approaches
+from orthocal.measurement.motion.approach import possible_approaches
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import nominal_sensitivity
@@ -529,20 +529,15 @@ def _with_approaches(session: Session) -> Session:
     Raises:
         ParameterError: If no posture can be approached.
     """
-    approaches = usual_approaches(session.robot)
-    if not approaches:
+    by_approach = possible_approaches(session.robot, session.postures)
+    if not by_approach:
         return session
-    drives = np.array([p.drives for p in session.postures.values()])
-    possible = {
-        a: dict(zip(session.postures, can_approach(session.robot, drives, a), strict=True))
-        for a in approaches
-    }
-    conditions = {a: Conditions(a) for a in approaches}
+    conditions = {a: Conditions(a) for a in by_approach}
     readings = tuple(
         Reading(r.setup, r.posture, conditions=conditions[a])
         for r in session.readings
-        for a in approaches
-        if possible[a][r.posture]
+        for a, possible in by_approach.items()
+        if r.posture in possible
     )
     if not readings:
         raise ParameterError("no posture can be approached within the travel", where="plan")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -16,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from orthocal.arrays import Array, Indices
+from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.tool_error import (
     ErrorStatistics,
     ToolErrorStatistics,
@@ -34,12 +36,12 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_groups import OF_GAUGE
+from orthocal.observation.sensor_groups import shared_gauge_parameters
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import is_offset
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
-from orthocal.statistics.information import VAGUE, Information
+from orthocal.statistics.information import VAGUE, Information, decompose, marginalise
 from orthocal.statistics.noise import estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -160,29 +162,53 @@ class ToolForecast:
         """Calibration problem of a session's readings."""
         return with_gauge_noise(CalibrationProblem(session, self.selection))
 
+    def limits(self, session: Session) -> tuple[EffectLimits, ...]:
+        """Limits of the effects beside geometry, before and after a session's readings."""
+        return find_limits(self.problem(session), stated_sigma(session.gauge))
+
     def prior_information(
         self, problem: CalibrationProblem, state: Sequence[str], measured: Session | None
     ) -> Array:
         """Inverse covariance of the state from its priors and from existing readings.
 
-        The shape is (n_state, n_state), in units of the prior standard deviations.
+        The existing readings determine errors of the machine and of gauges that are used again. All
+        their other parameters are marginalised. They include the positions of fixed balls and
+        instruments, which further readings do not share.
 
         Args:
             problem: Problem whose free parameters include the state.
             state: Names of the parameters of the state.
             measured: Existing readings.
+
+        Returns:
+            Shape (n_state, n_state), in units of the prior standard deviations of `problem`.
         """
         index = [problem.free.index(name) for name in state]
-        prior = np.diag(np.maximum(problem.prior_precision[index], VAGUE))
+        precision = np.maximum(problem.prior_precision[index], VAGUE)
         if measured is None:
-            return np.asarray(prior)
-        return np.asarray(prior + _information(self.problem(measured), state, measured))
+            return np.diag(precision)
+        existing = self.problem(measured)
+        shared = {name: name for name in self.selection.names}
+        shared |= shared_gauge_parameters(problem.session, measured)
+        known = [i for i, name in enumerate(state) if name in shared]
+        columns = [existing.free.index(shared[state[i]]) for i in known]
+        scale = problem.theta_scale[index][known] / existing.theta_scale[columns]
+        # joined sessions have the prior that the first of them states
+        precision[known] = np.maximum(existing.prior_precision[columns], VAGUE) * scale**2
+        others = [i for i in range(existing.n_free) if i not in columns]
+        _, jacobian = existing.predict_and_jacobian(existing.active_theta)
+        information = decompose(jacobian[:, columns + others], existing.observations)
+        sigma = stated_sigma(measured.gauge)
+        rows = marginalise(information, len(columns), sigma=sigma).factor * scale / sigma
+        result = np.diag(precision)
+        result[np.ix_(known, known)] += rows.T @ rows
+        return result
 
     def after(
         self,
         session: Session,
         *,
-        weight: float | None = None,
+        weights: Array | None = None,
         entered: bool = True,
         machines: Sequence[Array] | None = None,
     ) -> Expected:
@@ -194,8 +220,8 @@ class ToolForecast:
 
         Args:
             session: Setups and postures; the values of the readings are not used.
-            weight: Standard deviation that weights the readings, [m]; by default that of the gauge.
-                It is larger if the model omits errors.
+            weights: Standard deviations that weight the readings, shape (n_entries,), [m]; by
+                default those of the gauges. They are larger if the model omits errors.
             entered: True if identified offsets were entered before and the remaining ones are
                 small; False to draw offsets from their priors.
             machines: Machines instead of drawn ones: free parameters of the session's problem,
@@ -206,7 +232,6 @@ class ToolForecast:
         """
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = stated_sigma(session.gauge)
         drawn = self._draw(problem, entered=entered) if machines is None else machines
         theta = np.array(list(drawn))
         _, passive, reached = problem.simulate(theta)
@@ -221,8 +246,9 @@ class ToolForecast:
                 _, of_closed = problem.predict_and_jacobian(theta[closed], passive[closed])
                 jacobians.update(zip(closed.tolist(), of_closed, strict=True))
             for i in block[~reached[block]].tolist():
-                jacobians[i] = _jacobian_or_none(problem, theta[i])
-            return [self._posterior(problem, others, j, noise, weight) for j in jacobians.values()]
+                with suppress(ClosureError):
+                    jacobians[i] = problem.predict_and_jacobian(theta[i])[1]
+            return [self._posterior(problem, others, j, weights) for j in jacobians.values()]
 
         results = [
             result
@@ -239,14 +265,7 @@ class ToolForecast:
 
     def about_nominal(self, session: Session) -> Expected:
         """Expected tool error to first order about the nominal machine, as in the search."""
-        problem = self.problem(session)
-        others = self._jacobian_of_others(session)
-        noise = stated_sigma(session.gauge)
-        jacobian = _jacobian_or_none(problem, problem.active_theta)
-        covariance, _ = self._posterior(problem, others, jacobian, noise)
-        if covariance is None:
-            raise ClosureError("cannot be read", posture="the planned ones")
-        return self._expected(covariance)
+        return self.after(session, machines=[self.problem(session).active_theta])
 
     def _jacobian_of_others(self, session: Session) -> Array | None:
         """Change of a session's readings by one prior std of each unmodelled error.
@@ -282,8 +301,7 @@ class ToolForecast:
         problem: CalibrationProblem,
         others: Array | None,
         jacobian: Array | None,
-        noise: float,
-        weight: float | None = None,
+        weights: Array | None = None,
     ) -> tuple[Array | None, float]:
         """Covariance of the errors of the estimate about a machine.
 
@@ -292,8 +310,7 @@ class ToolForecast:
             others: Jacobian of unmodelled errors, shape (n_entries, n_others), [m per prior std].
             jacobian: Jacobian of the readings about the machine, shape (n_entries, n_free), [m per
                 prior std]; None if the machine does not reach the postures.
-            noise: Standard deviation of a reading, [m].
-            weight: Standard deviation that weights the readings, [m]; by default `noise`.
+            weights: As in `after`; equal for readings with a common zero.
 
         Returns:
             The covariance, shape (n_names, n_names), [SI], or None if too few readings are
@@ -306,21 +323,22 @@ class ToolForecast:
         lost = 1.0 - float(possible.mean())
         if possible.sum() <= o.n_free_zeros:
             return None, lost
-        o = o.only(possible)
+        o, noise = o.only(possible), stated_sigma(problem.session.gauge)
+        excess = np.ones((o.size, 1))  # weighting standard deviations, divided by those of noise
+        if weights is not None:
+            excess = (weights / (noise * problem.noise_ratio))[possible, None]
         precision = np.maximum(problem.prior_precision, VAGUE)
-        weight = noise if weight is None else weight
-        jacobian = project_out_zeros(jacobian[possible], o)
-        inverse = Information(jacobian).posterior(sigma=weight, precision=precision).covariance
+        jacobian = project_out_zeros(jacobian[possible], o) / excess
+        inverse = Information(jacobian).posterior(sigma=noise, precision=precision).covariance
         scale = problem.theta_scale[:n]
-        covariance = inverse
-        if weight != noise:  # the scatter of the readings is smaller than their weight implies
-            gain = inverse @ jacobian.T
-            covariance = inverse - (weight**2 - noise**2) / weight**4 * (gain @ gain.T)
+        # the scatter of the readings is smaller than their weights imply
+        gain = inverse @ jacobian.T / noise
+        covariance = inverse - gain * (1.0 - excess.T**-2) @ gain.T
         identified = covariance[:n, :n] * np.outer(scale, scale)
         if others is None:
             return identified, lost
-        others = project_out_zeros(others[possible], o)
-        bias = (inverse @ (jacobian.T @ others) / weight**2)[:n] * scale[:, None]
+        others = project_out_zeros(others[possible], o) / excess
+        bias = (inverse @ (jacobian.T @ others) / noise**2)[:n] * scale[:, None]
         variance = np.diag(self.prior_stds[n:] ** 2)
         cross = bias * self.prior_stds[n:]
         return np.block([[identified + bias @ bias.T, -cross], [-cross.T, variance]]), lost
@@ -392,48 +410,11 @@ class CriterionWeight:
         return _root(flat.reshape(-1, flat.shape[2]))
 
 
-def _jacobian_or_none(problem: CalibrationProblem, theta: Array) -> Array | None:
-    """Identification Jacobian about a machine; None if it cannot reach a posture."""
-    try:
-        return problem.predict_and_jacobian(theta)[1]
-    except ClosureError:
-        return None
-
-
 def _root(rows: Array) -> Array:
     """R with R Rᵀ = rowsᵀ rows and the smallest number of columns, shape (n, p)."""
     values, vectors = np.linalg.eigh(rows.T @ rows)
     positive = values > values[-1] * 1e-14
     return np.asarray(vectors[:, positive] * np.sqrt(values[positive]))
-
-
-def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
-    """Information of a session about the state, shape (n_state, n_state).
-
-    All other parameters of the session are marginalised. They include the positions of its fixed
-    balls and instruments, which further readings do not share.
-    """
-    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
-    jacobian = project_out_zeros(jacobian, problem.observations)
-    information = jacobian.T @ jacobian / stated_sigma(measured.gauge) ** 2
-    lasting = {
-        name
-        for i, name in enumerate(problem.free)
-        if name in state and (i < problem.n_machine or name.startswith(OF_GAUGE))
-    }
-    others = [i for i, name in enumerate(problem.free) if name not in lasting]
-    columns = [problem.free.index(name) for name in state if name in lasting]
-    places = [i for i, name in enumerate(state) if name in lasting]
-    of_others = information[np.ix_(others, others)] + np.diag(
-        np.maximum(problem.prior_precision[others], VAGUE)
-    )
-    cross = information[np.ix_(columns, others)]
-    marginal = information[np.ix_(columns, columns)]
-    if others:
-        marginal = marginal - cross @ np.linalg.solve(of_others, cross.T)
-    of_state = np.zeros((len(state), len(state)))
-    of_state[np.ix_(places, places)] = marginal
-    return of_state
 
 
 def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
@@ -462,10 +443,9 @@ def state_noise(session: Session) -> Session:
         values = o.values(session.values)[group.entries]
         sigma, dof = estimate_repeatability(values, o.only(group.entries))
         if not (dof and sigma > 0.0):
-            key = f"gauges.{group.name}.sigma_mm" if group.name else "gauge.sigma_mm"
             raise SessionError(
                 "is missing; a plan needs the repeatability of the readings",
-                where=key if session.path is None else f"{session.path}: {key}",
+                where=session.locate_gauge_key(group.name, "sigma_mm"),
             )
         gauges[group.name] = replace(group.gauge, sigma=sigma)
     return replace(session, gauges=gauges)

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.effect_limits import EffectLimits, find_limits
+from orthocal.assessment.effect_limits import EffectLimits
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.choice import Choice
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import state_common_approach
-from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.candidates import ON_AXIS, directions_across
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name
 from orthocal.planning.expected_error import Expected, ToolForecast
@@ -93,7 +92,7 @@ def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> Fixe
         before=forecast.before,
         expected=forecast.after(scheduled),
         first_round=forecast.after(scheduled, entered=False),
-        effects=find_limits(forecast.problem(scheduled), stated_sigma(scheduled.gauge)),
+        effects=forecast.limits(scheduled),
     )
 
 

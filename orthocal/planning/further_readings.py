@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import NamedTuple
 
-from orthocal.assessment.effect_limits import EffectLimits, find_limits
+from orthocal.assessment.effect_limits import EffectLimits
 from orthocal.assessment.effect_separability import WARMER
 from orthocal.effects.loading import measurable_effects, neutral_values
 from orthocal.effects.protocol import Condition
-from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.plan_comparison import Comparison
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session
@@ -85,7 +84,7 @@ def _evaluate(
     """Limit of an effect after further readings, and their gain at the tool."""
     forecast, plan = comparison.forecast, comparison.equipment.schedule(comparison.plan)
     session = comparison.join(extension.session)
-    limits = find_limits(forecast.problem(session), stated_sigma(session.gauge))
+    limits = forecast.limits(session)
     after = next(e for e in limits if (e.effect, e.unit) == (limit.effect, limit.unit))
     sessions = session, comparison.join(plan)
     tool, without = (forecast.about_nominal(s).reported.rms for s in sessions)

@@ -32,8 +32,6 @@ class Pairs:
     """First reading of each pair, shape (n_pairs,)."""
     second: Indices
     """Second reading of each pair, shape (n_pairs,)."""
-    flat: Indices
-    """Index of each pair in a flattened matrix of shape (m, m), shape (n_pairs,)."""
     within_range: Indices
     """Number of readings within the gauge's range if the setup begins in each reading, (m,)."""
 
@@ -42,16 +40,15 @@ class Pairs:
         """All pairs within the gauge's range."""
         allowed = setup.reachable.copy()
         np.fill_diagonal(allowed, False)
-        flat = np.flatnonzero(allowed)
-        first, second = np.divmod(flat, len(allowed))
-        return Pairs(first, second, flat, setup.reachable.sum(axis=1))
+        first, second = np.nonzero(allowed)
+        return Pairs(first, second, setup.reachable.sum(axis=1))
 
     def with_count(self, count: int) -> Pairs:
         """Pairs whose first reading has at least `count` readings within the gauge's range."""
         if (self.within_range >= count).all():
             return self
         enough = self.within_range[self.first] >= count
-        return Pairs(self.first[enough], self.second[enough], self.flat[enough], self.within_range)
+        return Pairs(self.first[enough], self.second[enough], self.within_range)
 
 
 def pair_gains(product: Array, spread: Array, noise: float, *, absolute: bool) -> Array:
@@ -181,7 +178,7 @@ class SetupGain:
         −w wᵀ / w_p. Residual effects and variances of all readings change by one product each.
         """
         spread = self.spread[rows]
-        covariance = self._covariance(spread, rows)
+        covariance = spread[:, rows] + self.noise * np.eye(len(rows))
         inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         in_zero, of_zero = np.zeros(len(rows)), 0.0
         if not self.setup.absolute:
@@ -273,7 +270,7 @@ class SetupGain:
         for k in range(len(gains), count):
             if k >= len(chosen):
                 excluded[chosen] = True
-                single = self._single_gains(effect, variance)
+                single = np.vecdot(effect, effect) / (np.maximum(variance, 0.0) + self.noise)
                 np.putmask(single, excluded, -1.0)
                 best = first_largest(single)
                 if excluded[best]:
@@ -290,18 +287,6 @@ class SetupGain:
             effect = np.subtract(effect, change, out=None if effect is self.effect else effect)
             variance = variance - column**2
         return tuple(gains), tuple(chosen)
-
-    def _covariance(self, spread_rows: Array, rows: list[int]) -> Array:
-        """V_SS + σ² I of readings, from their rows of V."""
-        covariance = spread_rows[:, rows]
-        covariance[np.diag_indices(len(rows))] += self.noise
-        return covariance
-
-    def _single_gains(self, effect: Array, variance: Array) -> Array:
-        """Gain of each reading alone, shape (m,)."""
-        scale = np.maximum(variance, 0.0)
-        scale += self.noise
-        return np.asarray(np.vecdot(effect, effect) / scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -370,7 +355,7 @@ class PointGain:
             count: Largest number of pairs.
         """
         allowed = np.zeros_like(self.setup.reachable)
-        allowed.reshape(-1)[pairs.flat] = True
+        allowed[pairs.first, pairs.second] = True
         blocks = self.effect.reshape(len(allowed), -1, self.effect.shape[1])
         gains = self._trace(np.einsum("ibr,icr->ibc", blocks, blocks), self._blocks(self.spread))
         ranked: list[tuple[float, tuple[int, int]]] = []

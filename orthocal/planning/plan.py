@@ -12,14 +12,13 @@ from types import NoneType
 import numpy as np
 
 from orthocal.arguments import require_kind, require_seed
-from orthocal.assessment.effect_limits import EffectLimits, find_limits
+from orthocal.assessment.effect_limits import EffectLimits
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.motion.approach import usual_approaches
-from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.planning.candidates import (
     MIN_READINGS,
     Candidates,
@@ -445,7 +444,7 @@ def _evaluate(
                         if measured is None
                         else forecast.after(measured, entered=comparison.entered)
                     ),
-                    lambda: find_limits(forecast.problem(joined), stated_sigma(joined.gauge)),
+                    lambda: forecast.limits(joined),
                 ),
                 killed=KILLED,
             )

@@ -32,27 +32,23 @@ def build_session(
         UnreachablePathError: If too few postures of a setup remain.
     """
     while True:
+        plan: Session | UnreachablePathError
         try:
             plan = _order_readings(candidates, planned, measured)
+            unusable = {
+                (base_name(r.setup), r.posture)
+                for r in plan.readings
+                if r.conditions is not None and "u" in (r.conditions.approach or "")
+            }
         except UnreachablePathError as e:
-            reduced = [
-                _without(candidates, setup, {e.posture} if name == base_name(e.setup) else set())
-                for name, setup in _named(candidates, planned, measured)
-            ]
-            if sum(len(s.chosen) for s in reduced) == sum(len(s.chosen) for s in planned):
-                raise
-            planned = reduced
-            continue
-        unknown_approach = {
-            (base_name(r.setup), r.posture)
-            for r in plan.readings
-            if r.conditions is not None and "u" in (r.conditions.approach or "")
-        }
+            plan, unusable = e, {(base_name(e.setup), e.posture)}
         reduced = [
-            _without(candidates, setup, {p for s, p in unknown_approach if s == name})
+            _without(candidates, setup, {p for s, p in unusable if s == name})
             for name, setup in _named(candidates, planned, measured)
         ]
         if sum(len(s.chosen) for s in reduced) == sum(len(s.chosen) for s in planned):
+            if isinstance(plan, UnreachablePathError):
+                raise plan
             return plan
         planned = reduced
 

@@ -25,8 +25,7 @@ def first_largest(values: Array) -> int:
     Args:
         values: Values, shape (n,), n > 0.
     """
-    largest = values.max()
-    return int((values >= largest - EQUALITY_TOLERANCE * abs(largest)).argmax())
+    return int(first_largest_of_rows(values[None])[0])
 
 
 def first_largest_of_rows(values: Array) -> Indices:

@@ -435,7 +435,7 @@ class Gains:
                 ranked += stack.best_pairs(self.covariance, self.root, noise, count)
         for which in set(range(len(search.reduced))) - stacked:
             setup, pairs = search.reduced[which], search.pairs[which].with_count(count)
-            if (gauges is None or setup.gauge in gauges) and pairs.flat.size:
+            if (gauges is None or setup.gauge in gauges) and pairs.first.size:
                 best = self.gain_of(setup).best_pairs(pairs, 1)
                 ranked += [(gain, which, pair) for gain, pair in best]
         return sorted(ranked, key=lambda r: r[1])

@@ -15,7 +15,7 @@ from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.cost_curve import HOUR, find_scale
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
-from orthocal.planning.owned_sensors import DIAL, DURATIONS, Duration, OwnedSensor
+from orthocal.planning.owned_sensors import DIAL, DURATIONS, OwnedSensor
 from orthocal.planning.selection import SetupSearch
 from orthocal.planning.timed_search import TimedSearch
 from orthocal.planning.tool_candidates import list_tool_candidates
@@ -85,7 +85,9 @@ def find_sensor_gains(
     """
     robot = forecast.robot
     usual = [
-        OwnedSensor(name, FINE if name == BAR else ORDINARY, keys, Path(name), _duration(keys))
+        OwnedSensor(
+            name, FINE if name == BAR else ORDINARY, keys, Path(name), DURATIONS[keys["sensor"]]
+        )
         for name, keys in KEYS.items()
     ]
     try:
@@ -105,7 +107,7 @@ def find_sensor_gains(
     for name, duration in equipment.durations(listed).items():
         timed = TimedSearch(search, {name: duration})
         with threadpool_limits(1):
-            plan = timed.fill(HOUR)
+            plan = timed.fill(search.empty, HOUR)
         if plan.setups:
             gains.append(
                 SensorGain(
@@ -125,11 +127,6 @@ def _list_candidates(robot: Robot, owned: Sequence[OwnedSensor]) -> tuple[Equipm
         gauge=ORDINARY, along=5, across=0.0, sections=(0.5,), spare_range=0.0, owned=tuple(owned)
     )
     return equipment, list_candidates(robot, equipment)
-
-
-def _duration(keys: Mapping[str, Any]) -> Duration:
-    """Usual durations of a sensor."""
-    return DURATIONS[keys["sensor"]]
 
 
 def _can_place(robot: Robot, sensor: OwnedSensor) -> bool:

@@ -143,7 +143,7 @@ class TimedSearch:
                 if of_gauge:
                     best = best_of(of_gauge, lambda o: o.gain)
                     plan = self.search.plan_of([best.planned])
-            plan = self._improve(self._fill(plan, minutes), minutes, together=1)
+            plan = self._improve(self.fill(plan, minutes), minutes, together=1)
             if len(plan.setups) > MAX_PAIRED_SETUPS:
                 return plan
             return self._improve(plan, minutes, together=2)
@@ -163,9 +163,13 @@ class TimedSearch:
                 break
         return plan
 
-    def fill(self, minutes: float) -> PlannedSetups:
-        """Choose setups of largest gain per minute within a time, without exchanges."""
-        return self._fill(self.search.empty, minutes)
+    def fill(self, plan: PlannedSetups, minutes: float) -> PlannedSetups:
+        """Add setups of largest gain per minute to a plan until none fits into a time."""
+        while True:
+            options = self._list_options(plan, minutes - self.minutes(plan.setups))
+            if not options:
+                return plan
+            plan = self.search.extend(plan, best_of(options, _rate).planned)
 
     def grow(self) -> Iterator[PlannedSetups]:
         """Add setups one by one, or readings to a setup that can be used once.
@@ -209,14 +213,6 @@ class TimedSearch:
         """Name of the gauge of a setup."""
         return self.search.reduced[planned.candidate].gauge
 
-    def _fill(self, plan: PlannedSetups, minutes: float) -> PlannedSetups:
-        """Add setups of largest gain per minute until none fits."""
-        while True:
-            options = self._list_options(plan, minutes - self.minutes(plan.setups))
-            if not options:
-                return plan
-            plan = self.search.extend(plan, best_of(options, _rate).planned)
-
     def _list_options(self, plan: PlannedSetups, minutes: float) -> list[_Option]:
         """Setups that fit into a time, with their gains in addition to a plan."""
         used = self.once & {self._gauge(setup) for setup in plan.setups}
@@ -251,9 +247,9 @@ class TimedSearch:
         if not options:
             return plan
         fastest = best_of(options, _rate).planned
-        plans = [plan, self._fill(self.search.extend(without, fastest), minutes)]
+        plans = [plan, self.fill(self.search.extend(without, fastest), minutes)]
         refined = self._refine(without, old[0] if len(old) == 1 else None, options)
-        plans.append(self._fill(refined, minutes))
+        plans.append(self.fill(refined, minutes))
         return best_of(plans, _negative_error)
 
     def _refine(

@@ -14,7 +14,7 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
-from orthocal.measurement.motion.approach import can_approach, usual_approaches
+from orthocal.measurement.motion.approach import possible_approaches
 from orthocal.planning.equipment import choose_box, place_reachable, posture_name
 from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot, require_tcp
@@ -163,12 +163,7 @@ class _Positions:
         """Reachable positions among tool positions of shape (n, n_coordinates), [m]."""
         unique = np.unique(points.round(9), axis=0)
         postures = place_reachable(robot, unique, middle)
-        names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
-        by_approach = {
-            a: frozenset(names[can_approach(robot, drives, a)].tolist())
-            for a in (usual_approaches(robot) if names.size else ())
-        }
-        return _Positions(robot, middle, postures, by_approach)
+        return _Positions(robot, middle, postures, possible_approaches(robot, postures))
 
     def names(self, points: Array) -> list[str]:
         """Names of the reachable ones of some positions, each once."""

@@ -311,6 +311,11 @@ class Session:
         """The first gauge with readings. The noise of other gauges is stated relative to it."""
         return next(iter((self.gauges_with_readings or self.gauges).values()))
 
+    def locate_gauge_key(self, gauge: str, key: str) -> str:
+        """File and key of a gauge, for messages."""
+        path = f"gauges.{gauge}.{key}" if gauge else f"gauge.{key}"
+        return path if self.path is None else f"{self.path}: {path}"
+
     def with_gauge(self, gauge: Gauge) -> Session:
         """Session with one gauge for all setups."""
         setups = {name: replace(s, gauge="") for name, s in self.setups.items()}

@@ -70,7 +70,7 @@ class AccuracyStudy(Study):
 
     def prepare(self) -> RandomMachines:
         """Random machines, the models that identify them, and the workspace."""
-        session = self._session_of_machines
+        session = self.session.with_effects(self.effects)
         models = [(self.session, self.choice)]
         if self.ignored:
             models.append((self._session_with_ignored, replace(self.choice, effects=None)))
@@ -82,11 +82,6 @@ class AccuracyStudy(Study):
             seed=self.seed,
             count=self.machines,
         )
-
-    @property
-    def _session_of_machines(self) -> Session:
-        """Plan with the effects of the machines."""
-        return self.session.with_effects(self.effects)
 
     @property
     def _session_with_ignored(self) -> Session:
@@ -148,7 +143,7 @@ class AccuracyStudy(Study):
         names = forecast.problem(session).free
         count = min(PREDICTED_MACHINES, self.machines)
         machines = [prepared.true_values(number, names) for number in range(count)]
-        return forecast.after(session, weight=prepared.model.sigma, machines=machines)
+        return forecast.after(session, weights=prepared.model.weights, machines=machines)
 
 
 def build_accuracy_study(
@@ -216,10 +211,9 @@ def _require_noise(session: Session) -> None:
     """Refuse a session with a gauge whose noise is not stated."""
     for name, gauge in session.gauges.items():
         if gauge.sigma is None:
-            key = f"gauges.{name}.sigma_mm" if name else "gauge.sigma_mm"
             raise SessionError(
                 "is missing: the study needs the noise of the gauge",
-                where=key if session.path is None else f"{session.path}: {key}",
+                where=session.locate_gauge_key(name, "sigma_mm"),
             )
 
 

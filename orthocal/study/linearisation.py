@@ -37,6 +37,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.study.random_machines import NO_CONTACT, NOT_ASSEMBLED
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once, require_counts
 from orthocal.units import MM
@@ -44,8 +45,6 @@ from orthocal.units import MM
 Flags = NDArray[np.bool_]
 
 IDENTIFIED = "identified"
-NOT_ASSEMBLED = "cannot be assembled"
-NO_CONTACT = "a tip misses the part it should touch"
 
 MAX_STEPS = 20
 """Largest number of undamped Gauss-Newton steps."""
@@ -101,6 +100,8 @@ class LinearisationStudy(Study):
                 "exact sensors, which only indicators support",
                 where="sensors",
             )
+        if all(stated_sigma(g) > 0.0 for g in self.session.gauges_with_readings.values()):
+            problem = with_gauge_noise(problem)  # readings are weighted as in a calibration
         linearisation = linearise_problem(problem)
         require_determined(problem, linearisation.information)
         matrices, differences = {}, np.zeros((0, problem.observations.size))
@@ -187,7 +188,8 @@ class _Prepared:
             add(f"steps_{k + 2}", theta)
         add("exact", exact)
         linear = errors / problem.theta_scale @ self.linearisation.jacobian.T
-        nonlinearity = _largest_difference(centred - linear, problem) / MM
+        nonlinear = (centred - linear) * problem.noise_ratio
+        nonlinearity = _largest_difference(nonlinear, problem) / MM
         reason = np.where(assembled, NO_CONTACT, NOT_ASSEMBLED)
         return {
             "status": np.where(measurable, IDENTIFIED, reason).tolist(),
@@ -269,10 +271,7 @@ class _Prepared:
                 whiten = np.linalg.inv(np.linalg.cholesky(covariance))
             solution = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
             errors[name] = sigma * float(np.sqrt((solution**2).sum(axis=1).max()))
-        noise = np.ones(self.problem.observations.size)
-        if all(stated_sigma(g) > 0.0 for g in self.problem.session.gauges_with_readings.values()):
-            noise = with_gauge_noise(self.problem).noise_ratio
-        jacobian = self.linearisation.jacobian / noise[:, None] / self.problem.theta_scale
+        jacobian = self.linearisation.jacobian / self.problem.theta_scale
         variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
         general = sigma * float(np.sqrt(variances.max()))
         return {**errors, **dict.fromkeys(METHODS[3:], general)}

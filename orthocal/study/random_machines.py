@@ -54,16 +54,19 @@ class MachineModel:
 
     problem: CalibrationProblem
     """Problem of the identified errors."""
-    program: BatchSolver
     sigma: float
-    """Standard deviation that weights a reading, [m]."""
+    """Standard deviation that weights a reading of the first gauge, [m]."""
 
     @staticmethod
-    def of(session: Session, choice: Choice, *, sigma: float) -> MachineModel:
-        """Build the model for a choice of errors."""
+    def of(session: Session, choice: Choice) -> MachineModel:
+        """Build the model for a choice of errors, with the stated noise of the gauges."""
         problem = CalibrationProblem(session, choice.select(session.robot.parameters))
-        problem = with_gauge_noise(problem)
-        return MachineModel(problem, BatchSolver(problem), sigma)
+        return MachineModel(with_gauge_noise(problem), stated_sigma(session.gauge))
+
+    @property
+    def weights(self) -> Array:
+        """Standard deviations that weight the readings, shape (n_entries,), [m]."""
+        return self.sigma * self.problem.noise_ratio
 
     @property
     def robot(self) -> Robot:
@@ -74,7 +77,7 @@ class MachineModel:
         """Estimate the errors of machines.
 
         Args:
-            values: Readings, shape (n_sets, n_entries), [m of the first gauge].
+            values: Readings, shape (n_sets, n_entries), [m].
 
         Returns:
             Free parameters, shape (n_sets, n_free), [SI], NaN if a calibration fails; and the mask
@@ -82,13 +85,13 @@ class MachineModel:
         """
         theta = np.full((len(values), self.problem.n_free), np.nan)
         converged = np.ones(len(values), dtype=np.bool_)
+        program, scaled = BatchSolver(self.problem), values / self.problem.noise_ratio
         try:
-            return self.program.solve(values, sigma=self.sigma).theta, converged
+            return program.solve(scaled, sigma=self.sigma).theta, converged
         except (SolverError, ClosureError):  # one by one, to find the machines that fail
             for i in range(len(values)):
                 try:
-                    program = BatchSolver(self.problem)
-                    theta[i] = program.solve(values[i : i + 1], sigma=self.sigma).theta[0]
+                    theta[i] = program.solve(scaled[i : i + 1], sigma=self.sigma).theta[0]
                 except (SolverError, ClosureError):
                     converged[i] = False
             return theta, converged
@@ -203,7 +206,7 @@ class MeasuredMachines:
     errors: Array
     """Elementary errors, shape (n_sets, n_errors), [SI]."""
     values: Array
-    """Single readings, shape (n_sets, n_entries), [m of the first gauge]."""
+    """Single readings, shape (n_sets, n_entries), [m]."""
     rows: Array
     """Readings of the rows of the session, shape (n_sets, n_rows), [m]."""
     status: Status
@@ -242,18 +245,17 @@ class RandomMachines:
             seed: Seed of errors, gauges and noise.
             count: Number of machines.
         """
-        sigma = stated_sigma(session.gauge)
-        unweighted = [MachineModel.of(s, c, sigma=sigma) for s, c in models]
+        unweighted = tuple(MachineModel.of(s, c) for s, c in models)
         limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
         machines = RandomMachines(
             seed,
-            CalibrationProblem(session, truth, noise_ratio=unweighted[0].problem.noise_ratio),
-            tuple(unweighted),
+            CalibrationProblem(session, truth),
+            unweighted,
             Tool.of(session, box),
             np.array(limits).T,
         )
-        weighted = [replace(m, sigma=machines.weighting_sigma(m, count)) for m in unweighted]
-        return replace(machines, models=tuple(weighted))
+        weighted = tuple(machines.weight_readings(m, count) for m in unweighted)
+        return replace(machines, models=weighted)
 
     @property
     def model(self) -> MachineModel:
@@ -271,7 +273,7 @@ class RandomMachines:
         readings, tools = [], []
         for problem in (self.truth, self.model.problem):
             no_errors = np.zeros((1, len(problem.functions.errors.names)))
-            readings.append(problem.predict(np.zeros(problem.n_free)))
+            readings.append(problem.predict(np.zeros(problem.n_free)) * problem.noise_ratio)
             tools.append(self.tool(problem.robot, no_errors)[0])
         return all(np.abs(one - other).max() < NEGLIGIBLE for one, other in (readings, tools))
 
@@ -304,9 +306,8 @@ class RandomMachines:
         draws, generators = zip(*(self.draw(n) for n in numbers), strict=True)
         theta, truth = np.array(draws), self.truth
         observations = truth.observations
-        predicted, _, closed = truth.simulate(theta * truth.theta_scale)
+        entries, _, closed = truth.simulate(theta * truth.theta_scale)
         status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
-        entries = predicted * truth.noise_ratio
         for i, rng in enumerate(generators):
             entries[i], _ = show_readings(truth.session, observations, entries[i], rng=rng)
         set_reason(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
@@ -314,7 +315,7 @@ class RandomMachines:
         out_of_range = (rows < self.limits[0]) | (rows > self.limits[1])
         set_reason(status, np.asarray(out_of_range.any(axis=1)), OUT_OF_RANGE)
         errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.errors_per_theta.T
-        return MeasuredMachines(errors, entries / truth.noise_ratio, rows, status)
+        return MeasuredMachines(errors, entries, rows, status)
 
     def estimate(self, measured: MeasuredMachines) -> list[Array]:
         """Estimates by each model, shape (n_sets, n_free), [SI].
@@ -352,20 +353,30 @@ class RandomMachines:
         tools[..., status != CALIBRATED] = np.nan
         return [tools[0] - self.tool.positions[..., None], *(tools[0] - t for t in tools[1:])]
 
-    def weighting_sigma(self, model: MachineModel, count: int) -> float:
-        """Standard deviation that weights a reading, [m].
+    def weight_readings(self, model: MachineModel, count: int) -> MachineModel:
+        """Model that weights the readings of each gauge as a calibration does.
 
-        It is the stated noise if the model identifies all errors of the machines. Otherwise it is
-        the median of the estimates from residuals of a few pilot machines, as in a calibration.
+        The weights are the stated noise if the model identifies all errors of the machines.
+        Otherwise they are the medians of the estimates from residuals of a few pilot machines.
+
+        Args:
+            model: Model with the stated noise.
+            count: Number of machines of the study.
         """
         if model.explains(self.truth):
-            return model.sigma
+            return model
         measured = self.measure(range(min(PILOT_MACHINES, count)))
-        options, sigmas = SolverOptions(solver="variable-projection"), []
+        options, estimates = SolverOptions(solver="variable-projection"), []
         for rows in measured.rows[measured.status == CALIBRATED]:
             with suppress(SolverError, ClosureError):
-                sigmas.append(fit_problem(model.problem.with_values(rows), options=options).sigma)
-        return max(float(np.median(sigmas)), model.sigma) if sigmas else model.sigma
+                fit = fit_problem(model.problem.with_values(rows), options=options)
+                estimates.append((fit.sigma, fit.sigma * fit.problem.noise_ratio))
+        if not estimates:
+            return model
+        sigmas, weights = zip(*estimates, strict=True)
+        sigma = max(float(np.median(sigmas)), model.sigma)
+        weights = np.maximum(np.median(weights, axis=0), model.weights)
+        return MachineModel(model.problem.with_noise_ratio(weights / sigma), sigma)
 
 
 def set_reason(status: Status, which: NDArray[Any], reason: str) -> None:

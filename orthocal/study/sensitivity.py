@@ -14,13 +14,13 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
-from orthocal.observation.observations import drive_table
 from orthocal.planning.equipment import place_tool
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
-from orthocal.session.session import Gauge, Reading, Session, describe_postures
+from orthocal.session.session import Conditions, Gauge, Reading, Session, describe_postures
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
@@ -53,38 +53,50 @@ class SensitivityStudy(Study):
         setups, postures = list(session.setups), list(session.postures)
         parameters = problem.machine_selection.parameters
         jacobian = problem.predict_and_jacobian(problem.active_theta)[1][:, : len(parameters)]
-        changes_by_output: dict[tuple[str, str], Array] = {}
-        postures_read = {postures[i] for i in observations.posture}
-        if session.robot.tcp is not None:
-            tool = ToolSensitivity(session.robot, free=problem.machine_selection.names)
-            tool_jacobian = tool(drive_table(session), names=postures)
-            tool_changes = tool_jacobian * problem.theta_scale[: len(parameters)]
-            for posture, rows in zip(postures, tool_changes, strict=True):
-                if posture in postures_read:
-                    changes_by_output.update(
-                        {(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)}
-                    )
-        approaches = dict(zip(observations.plus.tolist(), session.readings, strict=True))
-        for i in range(observations.size):
-            reading = approaches.get(i)
-            approach = None if reading is None else reading.approach
-            posture = describe_postures(postures[observations.posture[i]], None, approach)
-            key = posture, setups[observations.setup[i]]
+        approach_of = {
+            i: r.approach for i, r in zip(observations.plus.tolist(), session.readings, strict=True)
+        }
+        places = [(postures[k], approach_of.get(i)) for i, k in enumerate(observations.posture)]
+        changes_by_output = {} if session.robot.tcp is None else _tool_changes(problem, places)
+        for i, (posture, approach) in enumerate(places):
+            key = describe_postures(posture, None, approach), setups[observations.setup[i]]
             changes_by_output.setdefault(key, jacobian[i] * problem.noise_ratio[i])
         scales = np.array([p.prior_std * p.edge_factor for p in parameters])
-        n = len(changes_by_output)
+        n, changes = len(changes_by_output), np.array(list(changes_by_output.values()))
         return {
             "posture": [posture for posture, _ in changes_by_output for _ in parameters],
             "output": [output for _, output in changes_by_output for _ in parameters],
             "parameter": [p.name for p in parameters] * n,
-            "derivative": [
-                v for row in changes_by_output.values() for v in (row / MM / scales).tolist()
-            ],
+            "derivative": (changes / MM / scales).ravel().tolist(),
             "unit": [f"mm/{p.edge_unit}" for p in parameters] * n,
-            "um_per_prior_std": [
-                v for row in changes_by_output.values() for v in (row / UM).tolist()
-            ],
+            "um_per_prior_std": (changes / UM).ravel().tolist(),
         }
+
+
+def _tool_changes(
+    problem: CalibrationProblem, places: Sequence[tuple[str, str | None]]
+) -> dict[tuple[str, str], Array]:
+    """Changes of tool coordinates by one prior standard deviation of each error, [m].
+
+    Args:
+        problem: The problem.
+        places: Postures and approaches; the tool is at the reference temperature.
+
+    Returns:
+        Posture in words and coordinate, mapped to shape (n_machine,).
+    """
+    session, selection = problem.session, problem.machine_selection
+    result = {}
+    for approach in dict.fromkeys(a for _, a in places):
+        names = list(dict.fromkeys(n for n, a in places if a == approach))
+        drives = np.array([session.postures[n].drives for n in names])
+        conditions = UseConditions(approach=approach)
+        tool = ToolSensitivity(session.robot, free=selection.names, conditions=conditions)
+        for name, changes in zip(names, tool(drives, names=names), strict=True):
+            label = describe_postures(name, None, approach)
+            for axis, change in zip(TOOL, changes * selection.prior_stds, strict=True):
+                result[label, axis] = change
+    return result
 
 
 def build_sensitivity_study(
@@ -99,8 +111,8 @@ def build_sensitivity_study(
     Args:
         source: A robot of Orthoglide type, measured by the paper's plan; or a session of any robot.
         free: Names or globs of the errors; default: all that affect a reading or the tool.
-        points: Tool positions at which every setup is read in place of its postures: commanded
-            coordinates, shape (K, n_coordinates), [m].
+        points: Tool positions at which every setup is read in place of its postures, with each of
+            its approaches: commanded coordinates, shape (K, n_coordinates), [m].
         displacements: Displacements of the paper's postures.
 
     Raises:
@@ -123,7 +135,10 @@ def build_sensitivity_study(
 
 
 def _at_points(session: Session, points: Array) -> Session:
-    """Session in which every setup is read at every tool position."""
+    """Session in which every setup is read at every tool position, from each side of approach.
+
+    Conditions are those of the first reading of the setup with the same approach.
+    """
     names = [f"point_{i + 1}" for i in range(len(points))]
     postures_at_points = place_tool(session.robot, names, points)
     postures = {
@@ -133,7 +148,15 @@ def _at_points(session: Session, points: Array) -> Session:
     aligned_at = session.alignment_postures
     setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
     alignment = {n: session.postures[n] for n in aligned_at.values()}
-    readings = tuple(Reading(setup, posture) for setup in setups for posture in postures)
+    conditions: dict[str, dict[str | None, Conditions | None]] = {name: {} for name in setups}
+    for r in session.readings:
+        conditions[r.setup].setdefault(r.approach, r.conditions)
+    readings = tuple(
+        Reading(setup, posture, conditions=stated)
+        for setup, by_approach in conditions.items()
+        for posture in postures
+        for stated in (by_approach.values() or (None,))
+    )
     postures = {**postures, **alignment}
     session_at_points = replace(session, setups=setups, postures=postures, readings=readings)
     check_contacts(session_at_points)

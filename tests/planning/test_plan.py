@@ -312,7 +312,7 @@ def test_the_memory_of_a_plan_is_released_with_it(orthoglide):
     candidates = search.candidates
     plan = search.choose([3] * 3, starts=2)
     list(search.grow([3] * 3))
-    arrays = [s.reachable for s in candidates.setups] + [p.flat for p in search.pairs]
+    arrays = [s.reachable for s in candidates.setups] + [p.first for p in search.pairs]
     kept = [weakref.ref(array) for array in arrays]
     del arrays, candidates, search, plan
     gc.collect()

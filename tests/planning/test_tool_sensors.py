@@ -34,6 +34,7 @@ from orthocal.estimation.choice import resolve_choice
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.gauge_noise import stated_sigma
@@ -523,26 +524,60 @@ def test_a_plan_of_points_is_one_setup_within_its_time(tracked):
     assert (times[-1] - times[0]).total_seconds() == pytest.approx(19 * 30.0)
 
 
-@pytest.mark.parametrize("keys", ["", "frame: {tolerance_mm: 1, tolerance_mrad: 2}\n", CORRELATED])
-def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
-    equipment = Equipment(owned=owned(track=TRACKER + keys))
-    robot = without_legs()
-    session = list_candidates(robot, equipment)
-    forecast = ToolForecast(robot, resolve_choice("lengths", None).select(robot.parameters))
+def search_plan(robot, sensors, counts, measured=None):
+    """Plan without closing readings, the error of its search, and the forecast of lengths alone."""
+    session = list_candidates(robot, Equipment(owned=sensors))
+    selection = resolve_choice("lengths", None).select(robot.parameters)
+    forecast = ToolForecast(robot, selection, others={})
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     search = SetupSearch.of(
         candidates,
-        forecast.prior_information(candidates.problem, candidates.state, None),
+        forecast.prior_information(candidates.problem, candidates.state, measured),
         forecast.weight_of("aligned", len(candidates.state)),
     )
-    planned = search.choose([7], starts=1)
-    plan = build_session(candidates, planned.setups)
+    planned = search.choose(counts, starts=1)
+    plan = build_session(candidates, planned.setups, measured)
     once = replace(plan, readings=tuple(r for r in plan.readings if r.cycle == 1))
-    assert len(once.readings) == 21
-    nominal = ToolForecast(
-        robot, resolve_choice("lengths", None).select(robot.parameters), others={}
-    ).about_nominal(once)
-    assert planned.error == pytest.approx(nominal.reported.rms, rel=1e-6)
+    return once, planned.error, forecast
+
+
+@pytest.mark.parametrize("keys", ["", "frame: {tolerance_mm: 1, tolerance_mrad: 2}\n", CORRELATED])
+def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
+    plan, error, forecast = search_plan(without_legs(), owned(track=TRACKER + keys), [7])
+    assert len(plan.readings) == 21
+    assert error == pytest.approx(forecast.about_nominal(plan).reported.rms, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        "length_mm: 50\nlength_tolerance_mm: unknown\n",
+        "length_mm: 50\nlength_tolerance_mm: 0.01\n",
+        "length_mm: 50\nlength_tolerance_mm: 0\nscale_tolerance: 0.1\n",
+        "length_mm: 60\nlength_tolerance_mm: 0.01\n",
+    ],
+)
+def test_the_search_beside_readings_of_the_same_bar_agrees_with_the_forecast(owned, keys):
+    """The bar was stated with other tolerances, or had another length."""
+    robot = without_legs()
+    bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-25, 25]\n"
+    with few_balls(3):
+        measured, *_ = search_plan(robot, owned(bar=bar + keys), [6, 6])
+        plan, error, forecast = search_plan(robot, owned(bar=BAR), [5, 5], measured)
+    joined = join_sessions([measured, plan])
+    assert error == pytest.approx(forecast.about_nominal(joined).reported.rms, rel=1e-6)
+
+
+def test_the_search_beside_joined_readings_agrees_with_the_forecast(owned):
+    """The bar that is planned is that of the second session."""
+    robot = without_legs()
+    bars = BAR.replace("50", "60").replace("unknown", "0.01"), BAR.replace("unknown", "0.1")
+    with few_balls(3):
+        sessions = [search_plan(robot, owned(bar=bar), [6])[0] for bar in bars]
+        measured = join_sessions(sessions)
+        plan, error, forecast = search_plan(robot, owned(bar=BAR), [5, 5], measured)
+    joined = join_sessions([measured, plan])
+    assert error == pytest.approx(forecast.about_nominal(joined).reported.rms, rel=1e-6)
 
 
 def test_measured_points_have_no_information_about_the_instrument_of_further_points(owned):

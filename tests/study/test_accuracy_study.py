@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibrated import plan_of
-from gauges import exact
+from gauges import exact, with_gauges
 from machines import place
 from tolerances import TRUTH_BACK
 
@@ -47,6 +47,26 @@ def test_tool_error_agrees_with_the_covariance(name, model):
     assert result.standard_error < 0.05 * result.after
     for e in result.parameters:
         assert abs(e.rms - e.predicted) < 4.5 * e.standard_error + 0.02 * e.predicted
+
+
+@pytest.mark.slow
+def test_gauges_of_different_noise(workshop):
+    """Unmodelled errors increase the weights of each gauge, whichever is the first."""
+    noise, results = {"coarse": 10e-6, "fine": 0.5e-6}, []
+    for order in (("coarse", "fine"), ("fine", "coarse")):
+        gauges = {name: Gauge(noise[name]) for name in order}
+        session = with_gauges(workshop, gauges, set(list(workshop.setups)[::2]))
+        study = build_accuracy_study(
+            session, Choice("offsets", tolerances=NEAR), machines=100, half_side=0.05
+        )
+        results.append((study, run_study(study)))
+    one, other = (table.columns for _, table in results)
+    for name in ("tool_um", "error.x_slide.offset_mm"):
+        assert one[name] == pytest.approx(other[name], rel=1e-6, abs=1e-6)
+    summaries = [summarise_accuracy(study, table) for study, table in results]
+    predicted = [s.predicted.reported.rms for s in summaries]
+    assert predicted[0] == pytest.approx(predicted[1], rel=1e-6)
+    assert abs(summaries[0].after - predicted[0]) < 3.0 * summaries[0].standard_error
 
 
 def test_standard_errors_of_the_papers_plan():

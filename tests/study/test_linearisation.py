@@ -19,10 +19,10 @@ from orthocal.session.session import Gauge
 from orthocal.study.linearisation import (
     IDENTIFIED,
     METHODS,
-    NO_CONTACT,
     build_linearisation_study,
     summarise_linearisation,
 )
+from orthocal.study.random_machines import NO_CONTACT
 from orthocal.study.runner import run_study
 from orthocal.study.study import run_task
 
@@ -215,6 +215,28 @@ def test_standard_errors_do_not_depend_on_the_order_of_gauges(root):
     weighted = jacobian / sigma[problem.observations.setup][:, None]
     expected = np.sqrt(np.linalg.inv(weighted.T @ weighted).diagonal().max())
     assert errors == pytest.approx([expected] * 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("order", [("coarse", "fine"), ("fine", "coarse")])
+def test_readings_are_weighted_by_the_noise_of_their_gauge(root, order):
+    """As in a calibration. The errors are so large that the equations contradict each other."""
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+    gauges = {name: Gauge({"coarse": 20e-6, "fine": 2e-6}[name]) for name in order}
+    session = with_gauges(plan, gauges, set(list(plan.setups)[:3]))
+    study = build_linearisation_study(session, along=[1.0, -0.5, 0.25], sizes=[20.0])
+    columns = run_study(study).columns
+    problem = build_problem(session, model="offsets", prior=False)
+    truth = np.array([20e-3, -10e-3, 5e-3])
+    change = problem.predict(truth) - problem.predict(np.zeros(3))
+    jacobian = linearise_problem(problem).jacobian / problem.theta_scale
+    sigma = np.array([2e-6 if i < 3 else 20e-6 for i in range(6)])[problem.observations.setup]
+    rows = np.hstack([jacobian, problem.zero_incidence]) / sigma[:, None]
+    found = np.linalg.lstsq(rows, change / sigma)[0][:3]
+    assert columns["first_order"] == pytest.approx([np.abs(found - truth).max() * 1e3], rel=1e-6)
+    remaining = change - jacobian @ truth
+    of_zero = [np.ptp(remaining[problem.observations.zero == z]) for z in range(6)]
+    assert columns["reading_mm"][0] == pytest.approx(max(of_zero) * 1e3, rel=1e-6)
+    assert columns["exact"][0] < 1e-6
 
 
 def test_unidentifiable_errors(orthoglide):

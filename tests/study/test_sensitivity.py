@@ -37,6 +37,35 @@ def test_each_approach_has_its_row():
             assert row == pytest.approx(-other)
 
 
+def test_points_are_read_with_the_conditions_of_each_setup():
+    """From both sides. Expansion has no effect at the reference temperature."""
+    plan = effect_plan("backlash", "thermal", setups=("yx",))
+    names = ["*.backlash", "legs.expansion"]
+    study = build_sensitivity_study(plan, names, points=[[0.06, 0.0, 0.0]])
+    found = summarise_sensitivity(study, run_study(study))
+    approaches = {r.approach: r.conditions for r in reversed(plan.readings)}  # the first ones
+    labels = [posture for posture, output in found.rows if output == "yx"]
+    assert len(labels) == len(approaches) == 4
+    assert set(labels) == {f"point_1 (approach {approach})" for approach in approaches}
+    *backlash, expansion = (found.parameters.index(n) for n in study.parameters)
+    for approach, conditions in approaches.items():
+        one = row(found, f"point_1 (approach {approach})", "yx")
+        opposite = approach.translate(str.maketrans("pn", "np"))
+        other = row(found, f"point_1 (approach {opposite})", "yx")
+        # the temperatures differ by some kelvins, lengths by some 1e-5
+        assert one[backlash] == pytest.approx(-other[backlash], rel=1e-4)
+        tools = [
+            [row(found, f"point_1 (approach {a})", f"tool {axis}")[backlash] for axis in "xyz"]
+            for a in (approach, opposite)
+        ]
+        assert tools[0] == pytest.approx(-np.array(tools[1]))
+        # a drive stops short by half of its backlash, and moves the tool along its axis
+        sides = [0.5 if letter == "n" else -0.5 for letter in approach]
+        assert np.diagonal(tools[0]) == pytest.approx(sides)
+        assert np.abs(one[backlash]).max() > 0.1
+        assert (one[expansion] == 0.0) == (conditions.temperature == 20.0)
+
+
 def row(summary, posture, reads):
     return summary.derivatives[summary.rows.index((posture, reads))]
 

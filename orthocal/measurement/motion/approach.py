@@ -7,6 +7,7 @@ n if it falls, u if the direction is not stated.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from orthocal.kinematics.conditions import ARROWS
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
-from orthocal.session.session import Conditions, Reading, Session
+from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
 USUAL_LENGTH = 2e-3
@@ -128,6 +129,15 @@ def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: floa
         [USUAL_LENGTH if d.unit == "m" else USUAL_ANGLE for d in robot.drives]
     )
     return lengths * [SIGN_OF_LETTER[letter] or SIGN_OF_LETTER[other] for letter in approach]
+
+
+def possible_approaches(robot: Robot, postures: Mapping[str, Posture]) -> dict[str, frozenset[str]]:
+    """Usual approaches, mapped to the names of the postures that allow them."""
+    names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
+    return {
+        a: frozenset(names[can_approach(robot, drives, a)].tolist())
+        for a in (usual_approaches(robot) if names.size else ())
+    }
 
 
 def common_approach(robot: Robot, drives: Array) -> str | None:
