@@ -158,7 +158,7 @@ def _are_copied(
     """True if the noise of the gauges excludes so many equal readings in two measurements.
 
     The first reading of a setup does not count, because the dial is set there. Gauges must have
-    been mounted anew: there are several setups, and their mounting has tolerances. Most readings
+    been mounted again: there are several setups, and their mounting has tolerances. Most readings
     must differ from each other: readings near 0 on an exact machine hardly depend on the mounting.
 
     Args:

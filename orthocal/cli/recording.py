@@ -224,7 +224,7 @@ class Dialogue:
     def _keeps_conditions(self, index: int) -> bool:
         """True for a reading that is not taken again, so that only its typing is corrected.
 
-        Another setup was read since, or the program was started anew.
+        Another setup was read since, or the program was restarted.
         """
         is_past = self._last is None or self._is_of_earlier_setup(index)
         return self._recording.rows[index].is_read and is_past

@@ -45,7 +45,7 @@ def simulate(
 
     The directory receives session.yaml, readings.csv and truth.yaml. Readings state the conditions
     that effects of the machine need, and their time and temperature with --temperature. With the
-    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew.
+    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted again.
     Errors of other gauges are drawn and printed. If the sessions state different mechanical
     adjustments (adjusted_mm), the machine is adjusted.
 

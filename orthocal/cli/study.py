@@ -352,10 +352,10 @@ def _run(study: orthocal.Study, options: RunOptions) -> None:
     with message_at_interrupt(f"orthocal: stopped; {resume}"):
         table = run_study(
             study,
-            folder=out,
+            directory=out,
             workers=count,
             dask=dask,
-            anew=options.force,
+            discard=options.force,
             report=_progress_lines(study),
         )
     with worker_budget(1 if dask is not None else count):

@@ -262,7 +262,7 @@ def load_errors(
     """Load errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
 
     A gauge keeps its errors: those that the file lists under `sensors`, such as the scale of a dial
-    or the length of a bar, are loaded too. Setups are mounted anew.
+    or the length of a bar, are loaded too. Setups are mounted again.
 
     The errors are those of a machine with the mechanical adjustments `adjusted_mm` of the file, by
     default none. The differences to `adjusted` are added to them.

@@ -69,29 +69,29 @@ class StudyTable:
 def run_study(
     study: Study,
     *,
-    folder: Path | str | None = None,
+    directory: Path | str | None = None,
     workers: int = 1,
     dask: str | None = None,
-    anew: bool = False,
+    discard: bool = False,
     report: Callable[[Progress], None] | None = None,
 ) -> StudyTable:
     """Run the unfinished tasks of a study.
 
     Args:
         study: The study.
-        folder: Directory of the results, in which a stopped study is resumed.
+        directory: Directory of the results, in which a stopped study is resumed.
         workers: Number of processes on this machine.
         dask: Address of a Dask scheduler whose workers are used in place of local processes.
-        anew: Whether to discard the results in the directory.
+        discard: Whether to discard the results in the directory.
         report: Function that is called with the progress before the first and after each task.
 
     Raises:
         OrthocalError: If the directory belongs to another study, or the scheduler does not answer.
     """
-    path = None if folder is None else Path(folder) / JOURNAL
+    path = None if directory is None else Path(directory) / JOURNAL
     sizes = study.task_sizes
     total = sum(sizes)
-    with open_results(path, study, anew=anew) as (results, store):
+    with open_results(path, study, discard=discard) as (results, store):
         pending = [task for task in range(len(sizes)) if task not in results]
         completed = sum(sizes[task] for task in results)
         start, done = time.monotonic(), 0
@@ -121,14 +121,14 @@ def to_parquet(table: StudyTable) -> bytes:
 
 @contextmanager
 def open_results(
-    path: Path | None, study: Study, *, anew: bool = False
+    path: Path | None, study: Study, *, discard: bool = False
 ) -> Iterator[tuple[Results, Callable[[int, dict[str, list[Cell]]], None]]]:
     """Open the results of a study, with a function that stores those of another task.
 
     Args:
         path: Path to the journal; None to store nothing on disk.
         study: The study.
-        anew: Whether to discard the content of the journal.
+        discard: Whether to discard the content of the journal.
 
     Raises:
         OrthocalError: If the journal belongs to another study, is damaged, or is in use.
@@ -139,7 +139,7 @@ def open_results(
         yield results, results.__setitem__
         return
     busy = "is in use by another process; wait for it, or choose another directory"
-    with open_journal_file(path, busy=busy, discard=anew) as journal:
+    with open_journal_file(path, busy=busy, discard=discard) as journal:
         results = _read_results(journal, study)
 
         def store(task: int, columns: dict[str, list[Cell]]) -> None:

@@ -72,7 +72,7 @@ def test_killed_and_resumed_several_times(study, undisturbed, tmp_path):
     while kills < KILLS or not kept:  # where the machine is busy more is needed for a first one
         kills += 1
         assert kills < 10 * KILLS
-        child = FORK.Process(target=run_study, args=(study,), kwargs={"folder": tmp_path})
+        child = FORK.Process(target=run_study, args=(study,), kwargs={"directory": tmp_path})
         child.start()
         time.sleep(float(rng.uniform(0.0, (2.0 + 0.1 * kills) * a_task)))
         os.kill(child.pid, signal.SIGKILL)
@@ -81,22 +81,22 @@ def test_killed_and_resumed_several_times(study, undisturbed, tmp_path):
             with open_results(tmp_path / JOURNAL, study) as (stored, _):
                 assert kept <= set(stored)
                 kept = set(stored)
-    again = run_study(study, folder=tmp_path)
+    again = run_study(study, directory=tmp_path)
     assert results(again) == results(undisturbed)
 
 
 def test_only_an_incomplete_line_is_computed_again(study, undisturbed, tmp_path, monkeypatch):
-    run_study(study, folder=tmp_path)
+    run_study(study, directory=tmp_path)
     told = []
     with monkeypatch.context() as patched:  # finished tasks are not computed again
         patched.setattr(running, "run_task", None)
-        run_study(study, folder=tmp_path, report=told.append)
+        run_study(study, directory=tmp_path, report=told.append)
     assert [(p.done, p.resumed) for p in told] == [(12 * DRAWS, 12 * DRAWS)]
     file = tmp_path / JOURNAL
     whole = file.read_bytes()
     for cut in (1, 100, len(whole.splitlines(keepends=True)[-1])):
         file.write_bytes(whole[:-cut])
-        assert results(run_study(study, folder=tmp_path)) == results(undisturbed)
+        assert results(run_study(study, directory=tmp_path)) == results(undisturbed)
         assert file.read_bytes() == whole
 
 
@@ -132,7 +132,7 @@ def test_a_killed_worker(study, tmp_path, monkeypatch):
 
     monkeypatch.setattr(running, "run_task", kill_itself)
     with pytest.raises(OrthocalError, match="a process of the study was killed"):
-        run_study(study, workers=2, folder=tmp_path)
+        run_study(study, workers=2, directory=tmp_path)
     assert not forked_workers()
     with open_results(tmp_path / JOURNAL, study) as (stored, _):
         assert stored
@@ -214,7 +214,7 @@ def test_a_damaged_journal(study, tmp_path, spoil, message):
     spoilt = b"".join(spoil(file.read_bytes().splitlines(keepends=True)))
     file.write_bytes(spoilt)
     with pytest.raises(OrthocalError, match=message):
-        run_study(study, folder=tmp_path)
+        run_study(study, directory=tmp_path)
     assert file.read_bytes() == spoilt
 
 
@@ -223,7 +223,7 @@ def test_two_processes_do_not_write_one_journal(study, tmp_path):
         open_results(tmp_path / JOURNAL, study),
         pytest.raises(OrthocalError, match="is in use by another process"),
     ):
-        run_study(study, folder=tmp_path)
+        run_study(study, directory=tmp_path)
 
 
 def test_pandas_and_polars_open_the_table(undisturbed, tmp_path):

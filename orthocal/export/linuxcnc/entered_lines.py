@@ -72,7 +72,7 @@ def describe_other_lines(
         sentences.append(
             f"{file} differs from the lines that this calibration says to enter: "
             f"{differences}. The new session states what the file contains: measure with "
-            "these lines, or enter the others and run `orthocal again` anew."
+            "these lines, or enter the others and run `orthocal again` once more."
         )
     return "\n".join(sentences)
 
