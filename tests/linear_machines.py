@@ -81,7 +81,7 @@ class LinearMachines:
         covered = np.zeros(len(self.names))
         for i in np.unique(best):
             gain, stds = self.identify(SCALES[i])
-            half = expanded_uncertainty(*stds, dof=np.inf, contrasts=contrasts[i])
+            half = expanded_uncertainty(*stds, noise_factor=COVERAGE, contrasts=contrasts[i])
             factor = np.where(self.is_scaled, coverage_factor(contrasts[i]) * SCALES[i], COVERAGE)
             chosen = best == i
             apart = np.abs(gain @ readings[:, chosen] - truth[:, chosen])

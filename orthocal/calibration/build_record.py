@@ -100,6 +100,7 @@ def assemble_calibration(
         identifiability=_identifiability(fit, full_problem),
         base=full_problem is not None,
         noise=fit.noise,
+        noise_coverage=fit.noise_coverage(separate=noise is not None),
         rows_are_differences=session.only_differences,
         residuals=_residual_rows(fit, diagnostics, nominal),
         critical=diagnostics.outlier_threshold,

@@ -242,12 +242,12 @@ class Calibration(CalibrationRecord):
             std_scatter: Parts of them from the noise of the readings.
             std_scaled: Parts of them from errors that the tolerance scale multiplies.
         """
-        scale, noise = self.tolerance_scale, self.noise
-        dof = self.dof
-        if scale.factor != 1.0 and self.unmodelled.names and noise.source == "residuals":
-            dof = min(g.noise.without_residuals(g.sigma, g.resolution)[1] for g in self.gauges)
         return expanded_uncertainty(
-            std, std_scatter, std_scaled, dof=dof, contrasts=scale.contrasts
+            std,
+            std_scatter,
+            std_scaled,
+            noise_factor=self.noise_coverage,
+            contrasts=self.tolerance_scale.contrasts,
         )
 
     @property

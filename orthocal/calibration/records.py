@@ -303,6 +303,8 @@ class CalibrationRecord:
     """True if free parameters are base parameters: values of linear combinations."""
     noise: Noise
     """Noise of one reading of the first gauge."""
+    noise_coverage: SizeOrNaN
+    """Coverage factor of the parts of uncertainties from noise; NaN if the noise is unknown."""
     rows_are_differences: bool
     critical: SizeOrInf
     """Critical value: rows with a larger absolute studentised residual are outliers. Infinite if

@@ -30,6 +30,7 @@ from orthocal.estimation.weighting import (
     with_repeatability,
 )
 from orthocal.observation.gauge_noise import SMALLEST_SIGMA
+from orthocal.statistics.chance import COVERAGE, coverage_factor
 from orthocal.statistics.information import (
     Information,
     Posterior,
@@ -150,6 +151,36 @@ class Fit:
     def noise_covariance(self, *, noise: float | None = None) -> Array:
         """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
         return self._to_si(self._posterior(noise).noise_covariance)
+
+    def noise_coverage(self, *, separate: bool) -> float:
+        """Coverage factor of the part of uncertainties that is due to noise, k_σ.
+
+        Each gauge has the factor k_g of its noise, and causes the share w_gi of the noise variance
+        of error i. Then k_i² = Σ_g w_gi k_g² covers at least 95 % (Banerjee, Sankhya 22, 1960). The
+        result is the largest k_i of the errors of the machine. It is NaN if a noise is unknown.
+
+        Args:
+            separate: Whether residuals do not contribute to the noise (see `covariance`).
+        """
+        groups, problem = self.groups, self.problem
+        factors = np.array(
+            [
+                coverage_factor(
+                    noise.without_residuals(g.gauge.sigma, g.gauge.resolution)[1]
+                    if separate
+                    else noise.dof
+                )
+                for g, noise in zip(groups, self.noises.gauges, strict=True)
+            ]
+        )
+        if len(groups) == 1:
+            return float(factors[0])
+        jacobian = project_out_zeros(self.jacobian, problem.observations)
+        gain = self._posterior().inverse_normal[: problem.n_machine] @ jacobian.T
+        shares = np.array([np.square(gain[:, g.entries]).sum(axis=1) for g in groups])
+        shares = shares[:, shares.sum(axis=0) > 0.0]
+        mean_squares = (factors**2 @ shares) / shares.sum(axis=0)
+        return float(np.sqrt(mean_squares.max(initial=COVERAGE**2)))
 
     def inverse_normal(self) -> Array:
         """Inverse curvature of the objective, shape (n_free, n_free), [SI]."""

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache
+
+import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.observation.observations import drive_table
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.leg_indicator import BallIndicator
+from orthocal.sensors.protocol import Contact, Frames
 from orthocal.session.session import Session
+
+NEARBY = 1e-9
+"""Largest distance of a posture from the mechanical zero that may be a rounding error, [m, rad]."""
 
 
 def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
@@ -17,6 +25,64 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
 
     Returns:
         Names of setups, mapped to the names of the postures and the contacts in them.
+    """
+    place = _nominal_places(session)
+    postures = {name: i for i, name in enumerate(session.postures)}
+    read: dict[str, set[str]] = {name: set() for name in session.setups}  # postures by setup
+    for reading in session.readings:
+        read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
+    result = {}
+    for setup in session.setups.values():
+        names = sorted(read[setup.name], key=postures.__getitem__)
+        frames, at_zero = place(setup.sensor.frames(session.robot), [postures[n] for n in names])
+        result[setup.name] = names, setup.sensor.contact(frames, at_zero, session.robot)
+    return result
+
+
+def centre_balls(session: Session, setups: Iterable[str]) -> Session:
+    """Session whose balls are centred on the nominal rods in their alignment postures.
+
+    Args:
+        session: The session.
+        setups: Setups whose balls are centred. A ball that is aligned in the mechanical zero
+            keeps its place.
+    """
+    balls = balls_aligned_elsewhere(session)
+    chosen = [name for name in setups if name in balls]
+    if not chosen:
+        return session
+    postures = list(session.postures)
+    place, centred = _nominal_places(session), dict(session.setups)
+    for name in chosen:
+        ball, posture = balls[name]
+        frames, at_zero = place(ball.frames(session.robot), [postures.index(posture)])
+        sensor = ball.centred(frames, at_zero, session.robot)
+        centred[name] = replace(session.setups[name], sensor=sensor)
+    return replace(session, setups=centred)
+
+
+def balls_aligned_elsewhere(session: Session) -> dict[str, tuple[BallIndicator, str]]:
+    """Setups with a ball that is not aligned in the mechanical zero.
+
+    Returns:
+        Names of setups, mapped to the indicator and its alignment posture.
+    """
+    aligned_at = session.alignment_postures
+    return {
+        setup.name: (setup.sensor, posture)
+        for setup, zero in zip(session.setups.values(), session.zero_drives, strict=True)
+        if isinstance(setup.sensor, BallIndicator)
+        and np.abs(session.postures[posture := aligned_at[setup.name]].drives - zero).max() > NEARBY
+    }
+
+
+def _nominal_places(
+    session: Session,
+) -> Callable[[Frames, list[int]], tuple[list[Array], list[Array]]]:
+    """Function that places frames of a sensor on the nominal machine.
+
+    Its arguments are the frames and the indices of K postures. It returns poses in these postures,
+    shape (K, 4, 4) each, and poses in the reference posture, shape (4, 4) each.
     """
     robot = session.robot
     drives = drive_table(session) + session.active_offsets
@@ -32,18 +98,7 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
     def at_zero(frame: str) -> Array:
         return reference_poses(robot, [frame])[0]
 
-    postures = {name: i for i, name in enumerate(session.postures)}
-    read: dict[str, set[str]] = {name: set() for name in session.setups}  # postures by setup
-    for reading in session.readings:
-        read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
-    result = {}
-    for setup in session.setups.values():
-        names = sorted(read[setup.name], key=postures.__getitem__)
-        rows, frames = [postures[n] for n in names], setup.sensor.frames(robot)
-        contact = setup.sensor.contact(
-            [poses(f)[rows] for f in frames.in_posture],
-            [at_zero(f) for f in frames.at_zero],
-            robot,
-        )
-        result[setup.name] = names, contact
-    return result
+    def place(frames: Frames, rows: list[int]) -> tuple[list[Array], list[Array]]:
+        return [poses(f)[rows] for f in frames.in_posture], [at_zero(f) for f in frames.at_zero]
+
+    return place

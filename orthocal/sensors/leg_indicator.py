@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
@@ -70,6 +70,9 @@ EDGE = Tip("blade", 0.0)
 BESIDE_ROUNDING = 1e-5
 """Largest component of `beside` along leg or plunger that may be a rounding error, [m]."""
 
+LATERAL_DECIMALS = 9
+"""Decimals of the lateral position of a centred ball, [m]."""
+
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
 
@@ -105,7 +108,8 @@ class LegKeys(MountingKeys, SetupKeys):
     tip: TipKeys | None = None
     beside_mm: Annotated[list[Millimetres], Field(min_length=3, max_length=3)] | None = None
     """Displacement of the tip from the rod in the mechanical zero, across leg and plunger, in the
-    world frame. It is needed if the rod is displaced by this amount in the postures to read."""
+    world frame. By default a ball is centred on the rod in the alignment posture; a blade is not
+    displaced."""
 
     @field_validator("direction", mode="before")
     @classmethod
@@ -489,6 +493,24 @@ class BallIndicator(LegIndicator):
 
     __slots__ = ()
     touch = touch_by_ball
+
+    def centred(
+        self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot
+    ) -> LegIndicator:
+        """Indicator whose ball is in the plane of plunger and rod.
+
+        Args:
+            frames: Poses of the rod's ends in the alignment posture, shape (1, 4, 4) each.
+            at_zero: Pose of the leg's root in the reference posture, if drives alone move it.
+            robot: The robot.
+        """
+        at_rod = replace(self, beside=(0.0, 0.0, 0.0))
+        direction, _, side, start = _place(at_rod.constants(robot), [p[:3, 3] for p in at_zero])
+        root, end = (pose[0, :3, 3] for pose in frames)
+        normal = np.cross(end - root, direction)
+        distance = float((root - start) @ normal / (side @ normal))
+        x, y, z = (round(distance * v, LATERAL_DECIMALS) + 0.0 for v in side.tolist())
+        return replace(self, beside=(x, y, z))
 
 
 def _coordinate_plane(leg: Leg, value: float, where: str) -> float:

@@ -113,14 +113,14 @@ def expanded_uncertainty(
     std_scatter: ArrayLike,
     std_scaled: ArrayLike,
     *,
-    dof: float,
+    noise_factor: float,
     contrasts: float = math.inf,
 ) -> Array:
     """Expanded uncertainty U of estimates, of any shape, in their unit.
 
-    U² = k_ν² s² + k_n² t² + 2² (u² − s² − t²). Noise estimated with ν degrees of freedom causes the
-    part s of u, and errors whose scale was estimated from n contrasts cause the part t. Each has
-    its coverage factor. The variance of the other part is known.
+    U² = k_σ² s² + k_n² t² + 2² (u² − s² − t²). Noise causes the part s of u, and errors whose scale
+    was estimated from n contrasts cause the part t. Each has its coverage factor. The variance of
+    the other part is known.
 
     The parts are independent, and so are the estimates of their variances. Then U covers at least
     what its factors cover, 95 % (Banerjee, Sankhya 22, 1960). Effective degrees of freedom (Welch
@@ -130,7 +130,7 @@ def expanded_uncertainty(
         std: Standard deviations u from all contributions.
         std_scatter: Parts s of them from the noise of the readings.
         std_scaled: Parts t of them from errors that the tolerance scale multiplies.
-        dof: Degrees of freedom ν of the noise.
+        noise_factor: Coverage factor k_σ of the noise.
         contrasts: Number n of contrasts that determine the tolerance scale; infinite if it was not
             estimated.
     """
@@ -138,6 +138,6 @@ def expanded_uncertainty(
         np.square(np.asarray(part, dtype=np.float64)) for part in (std, std_scatter, std_scaled)
     )
     known = np.maximum(total - scatter - scaled, 0.0)
-    factors = (coverage_factor(dof), coverage_factor(contrasts), COVERAGE)
+    factors = (noise_factor, coverage_factor(contrasts), COVERAGE)
     parts = (scatter, scaled, known)
     return np.asarray(np.sqrt(sum(k**2 * v for k, v in zip(factors, parts, strict=True))))

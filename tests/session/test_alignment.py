@@ -15,6 +15,7 @@ from orthocal import (
     draw_errors,
     join_sessions,
     load_calibration,
+    load_plan,
     load_session,
     restore_session,
     simulate_session,
@@ -24,7 +25,10 @@ from orthocal import (
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.calibration.identify import identify
 from orthocal.estimation.tolerance_scale import AS_STATED
+from orthocal.measurement.motion.motion import guide, plan_motion
+from orthocal.output.sheet.gauge_position import find_gauge_position
 from orthocal.session.session import Gauge
+from orthocal.statistics.chance import confidence_factor
 
 QUICK = {"solver": "variable-projection"}
 ORDER = {"reversed": lambda n: np.arange(n)[::-1], "shuffled": np.random.default_rng(5).permutation}
@@ -170,6 +174,39 @@ def test_among_equally_near_postures_the_first_is_the_default(workshop):
     assert set(session.alignment_postures.values()) == {first}
 
 
+def test_a_useless_gauge_does_not_change_the_coverage_factor():
+    """The few readings of the other gauge determine the noise that matters."""
+    plan = plan_of("raw-cycles")
+    once = [r for r in plan.readings if r.cycle == 1]
+    alone = replace(plan, gauges={"dial": Gauge(None)}, readings=tuple(once))
+    alone = replace(alone, setups={n: replace(s, gauge="dial") for n, s in plan.setups.items()})
+    errors = draw_errors(plan.robot, ["*.offset"], seed=2)
+    alone = simulate_session(alone, errors, seed=3, sigma=20e-6).session
+    useless = {f"{n}_2": replace(s, name=f"{n}_2", gauge="bad") for n, s in alone.setups.items()}
+    readings = [
+        replace(r, setup=f"{r.setup}_2", cycle=c) for r in alone.readings for c in range(1, 6)
+    ]
+    noise = 2e-3 * np.random.default_rng(4).normal(size=len(readings))
+    both = replace(
+        alone,
+        gauges={"dial": Gauge(None), "bad": Gauge(None)},
+        setups=alone.setups | useless,
+        readings=(
+            *alone.readings,
+            *(replace(r, value=r.value + v) for r, v in zip(readings, noise, strict=True)),
+        ),
+    )
+    first, second = (
+        identify(s, "offsets", find_scale=lambda _: AS_STATED, **QUICK)[0] for s in (alone, both)
+    )
+    assert second.noise.dof > 50.0 > 10.0 > first.noise.dof
+    for one, other in zip(first.free, second.free, strict=True):
+        assert other.std_scatter == pytest.approx(one.std_scatter, rel=0.01)
+    expected = confidence_factor(first.noise.dof)
+    assert first.noise_coverage == expected > 2.1
+    assert second.noise_coverage == pytest.approx(expected, rel=1e-3)
+
+
 def test_a_stated_posture_changes_estimates(workshop, calibration):
     setups = {n: replace(s, aligned_at=f"{s.sensor.leg}_min") for n, s in workshop.setups.items()}
     other, _ = identify(replace(workshop, setups=setups), "full", **QUICK)
@@ -209,3 +246,60 @@ def test_an_unknown_posture_is_refused(workshop, tmp_path):
         load_session(file)
     assert caught.value.where == f"{file}: setups.{name}.aligned_at"
     assert "nowhere" in caught.value.problem
+
+
+OFF_AXIS = (0.004, 0.005, -0.003)
+"""Tool position of an alignment posture, [m]."""
+
+PLAN_OFF_AXIS = """
+robot: orthoglide
+gauge: {{sigma_mm: 0.005, tip: {{{tip}}}}}
+postures: {{zero: {{tcp_mm: [0, 0, 0]}}, off_axis: {{tcp_mm: [4, 5, -3]}}}}
+setups:
+  xy: {{leg: x, direction: y, section: {{fraction: 0.5}}, touches: a, aligned_at: {at}{more}}}
+  yz: {{leg: y, direction: z, section: {{fraction: 0.4}}, touches: b, aligned_at: {at}{more}}}
+"""
+BALL, BLADE = "ball: {radius_mm: 1.5}", "blade: {width_mm: 20}"
+"""Tips of a gauge, as keys."""
+
+
+def displacements(tmp_path, *, tip=BALL, at="off_axis", more=""):
+    """Displacements of the tips of a plan, by setup, [m]."""
+    file = tmp_path / "session.yaml"
+    file.write_text(PLAN_OFF_AXIS.format(tip=tip, at=at, more=more))
+    plan = load_plan(file)
+    return plan, {name: setup.sensor.beside for name, setup in plan.setups.items()}
+
+
+def test_a_ball_is_centred_on_the_rod_in_its_alignment_posture(tmp_path):
+    """Rods are parallel to their leg, so their lateral position in the section is that of a leg."""
+    plan, found = displacements(tmp_path)
+    length = plan.robot.legs["x"].length
+    for name, leg, lateral, fraction in (("xy", 0, 2, 0.5), ("yz", 1, 0, 0.4)):
+        across = np.delete(OFF_AXIS, leg)
+        shadow = np.sqrt(length**2 - across @ across)
+        slide = OFF_AXIS[leg] + shadow
+        expected = np.zeros(3)
+        expected[lateral] = (slide - (1.0 - fraction) * length) / shadow * OFF_AXIS[lateral]
+        assert abs(expected[lateral]) > 1e-3
+        np.testing.assert_allclose(found[name], expected, atol=1e-8)
+    # the sheet states the distance from the centre line in the alignment posture
+    guidance = guide(plan)
+    for motion in plan_motion(plan):
+        position = find_gauge_position(plan, motion, guidance, ())
+        assert np.linalg.norm(position.lateral_offset) < 1e-8
+    assert load_session(write_session(plan.with_values([0.0] * 4), tmp_path / "copy")).setups[
+        "xy"
+    ].sensor.beside == pytest.approx(found["xy"], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"at": "zero"}, {"tip": BLADE}, {"more": ", beside_mm: [0, 0, 0]"}],
+    ids=["aligned in the mechanical zero", "blade", "stated displacement"],
+)
+def test_other_tips_are_where_the_mechanical_zero_has_the_rod(tmp_path, keys):
+    plan, found = displacements(tmp_path, **keys)
+    assert set(found.values()) == {(0.0, 0.0, 0.0)}
+    copy = load_session(write_session(plan.with_values([0.0] * 4), tmp_path / "copy"))
+    assert {s.sensor.beside for s in copy.setups.values()} == {(0.0, 0.0, 0.0)}

@@ -153,12 +153,12 @@ def test_expanded_uncertainty_is_twice_the_deviation_or_students_factor_of_the_n
     assert coverage_factor(np.inf) == 2.0
     assert coverage_factor(3.0) == confidence_factor(3.0)
     assert np.isnan(coverage_factor(0.0))
-    assert expanded_uncertainty(3.0, 3.0, 0.0, dof=np.inf) == 6.0
-    assert expanded_uncertainty([5.0], [0.0], [0.0], dof=2.0, contrasts=2.0) == [10.0]
-    both = expanded_uncertainty(5.0, 3.0, 0.0, dof=3.0)
+    assert expanded_uncertainty(3.0, 3.0, 0.0, noise_factor=2.0) == 6.0
+    assert expanded_uncertainty([5.0], [0.0], [0.0], noise_factor=5.0, contrasts=2.0) == [10.0]
+    both = expanded_uncertainty(5.0, 3.0, 0.0, noise_factor=confidence_factor(3.0))
     assert both == pytest.approx(np.hypot(3.0 * confidence_factor(3.0), 8.0))
     # 1² + 2² + 2² = 3²: noise, scaled errors, priors of known size
-    each = expanded_uncertainty(3.0, 1.0, 2.0, dof=3.0, contrasts=4.0)
+    each = expanded_uncertainty(3.0, 1.0, 2.0, noise_factor=confidence_factor(3.0), contrasts=4.0)
     factors = np.array([confidence_factor(3.0), confidence_factor(4.0), 2.0])
     assert each == pytest.approx(np.linalg.norm(factors * [1.0, 2.0, 2.0]))
 
@@ -172,13 +172,15 @@ def test_expanded_uncertainty_covers_estimated_and_known_parts(contrasts):
     count, rng = 20000, np.random.default_rng(1)
     low, high = coverage_band(count)
     normal, factor = rng.normal(size=count), rng.chisquare(contrasts, size=count) / contrasts
-    alone = expanded_uncertainty(factor**0.5, 0.0, factor**0.5, dof=np.inf, contrasts=contrasts)
+    alone = expanded_uncertainty(
+        factor**0.5, 0.0, factor**0.5, noise_factor=2.0, contrasts=contrasts
+    )
     assert low <= (np.abs(normal) <= alone).sum() <= high
     for v2 in (0.1, 1.0, 3.0, 10.0):
         scaled = v2 * factor
         x = np.sqrt(1.0 + v2) * normal
         half = expanded_uncertainty(
-            np.sqrt(1.0 + scaled), 0.0, np.sqrt(scaled), dof=np.inf, contrasts=contrasts
+            np.sqrt(1.0 + scaled), 0.0, np.sqrt(scaled), noise_factor=2.0, contrasts=contrasts
         )
         assert (np.abs(x) <= half).sum() >= low
         if contrasts == 2 and v2 == 3.0:

@@ -42,7 +42,7 @@ from orthocal.measurement.files.session_keys import (
     SessionKeys,
 )
 from orthocal.measurement.files.session_postures import build_postures, require_mechanical_zero
-from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.contacts import centre_balls, locate_contacts
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
     NuisanceParameter,
@@ -111,8 +111,7 @@ def _load_session(
         readings_path=readings_path,
         sha256=session_digest(content, table, plan.compensation),
     )
-    check_contacts(session)
-    return session
+    return _with_contacts(session, keys)
 
 
 def _read_table(path: Path) -> bytes:
@@ -211,7 +210,17 @@ def load_plan(path: str | Path, *, wrong: list[SessionError] | None = None) -> S
         )
         for axis in split[name]
     )
-    session = replace(plan, readings=readings)
+    return _with_contacts(replace(plan, readings=readings), keys)
+
+
+def _with_contacts(session: Session, keys: SessionKeys) -> Session:
+    """Session with balls centred where no displacement is stated; all sensors touch.
+
+    Raises:
+        SessionError: If a sensor does not touch; names the setup and the posture.
+    """
+    undisplaced = [name for name in session.setups if "beside_mm" not in keys.setups.get(name, {})]
+    session = centre_balls(session, undisplaced)
     check_contacts(session)
     return session
 

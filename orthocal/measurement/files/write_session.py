@@ -27,6 +27,7 @@ from orthocal.measurement.files.readings_file import (
     format_readings,
 )
 from orthocal.observation.conditions import needed_conditions
+from orthocal.observation.contacts import balls_aligned_elsewhere
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.loading import packaged_robots, robot_digest
 from orthocal.robot.model import Robot
@@ -65,7 +66,7 @@ def session_document(session: Session) -> dict[str, Any]:
         document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
     if calibration := _calibration_document(session):
         document["calibration"] = calibration
-    aligned_at = session.alignment_postures
+    aligned_at, elsewhere = session.alignment_postures, balls_aligned_elsewhere(session)
     setups: dict[str, Any] = {}
     for setup in session.setups.values():
         (name, gauge), sensor = names_in_files(setup), setup.sensor
@@ -76,6 +77,8 @@ def session_document(session: Session) -> dict[str, Any]:
         setups.setdefault(
             name,
             {
+                # a ball that is aligned elsewhere is centred there if it states no displacement
+                **({"beside_mm": [0.0, 0.0, 0.0]} if setup.name in elsewhere else {}),
                 **write_sensor(sensor),
                 **({"gauge": gauge} if gauge else {}),
                 "aligned_at": aligned_at[setup.name],

@@ -24,8 +24,8 @@ SECTIONS = {
     "z": ("x", "-y", "[1, -1, 0]"),
 }
 TIPS = (
-    "touches: a, tip: {ball: {radius_mm: 1}}",
-    "touches: b, tip: {ball: {radius_mm: 8}}",
+    "touches: a, beside_mm: [0, 0, 0], tip: {ball: {radius_mm: 1}}",
+    "touches: b, beside_mm: [0, 0, 0], tip: {ball: {radius_mm: 8}}",
     "touches: a, tip: {blade: {width_mm: 44}}",
     "touches: b, tip: {blade: {width_mm: 60, radius_mm: 2}}",
 )
