@@ -77,7 +77,7 @@ def _redundancy(calibration: Calibration) -> list[Finding]:
     if calibration.is_checked:
         return []
     readings, errors = calibration.identifiability.n_readings, len(calibration.free)
-    return [words.no_redundancy(readings, errors, mounting=readings > calibration.rank)]
+    return [words.no_redundancy(readings, errors, mounting=readings > calibration.structural_rank)]
 
 
 def _residuals(calibration: Calibration) -> list[Finding]:

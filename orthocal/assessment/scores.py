@@ -83,8 +83,8 @@ class ModelResult:
 
     @property
     def rank(self) -> int:
-        """See `Calibration.rank`."""
-        return self.calibration.rank
+        """See `Calibration.structural_rank`."""
+        return self.calibration.structural_rank
 
     @property
     def redundancy(self) -> float:

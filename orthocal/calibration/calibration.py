@@ -91,10 +91,10 @@ class Calibration(CalibrationRecord):
         Priors of the machine do not count.
         """
         spectrum = self.identifiability
-        return max(spectrum.n_readings - self.rank - spectrum.n_nuisance, 0.0)
+        return max(spectrum.n_readings - self.structural_rank - spectrum.n_nuisance, 0.0)
 
     @property
-    def rank(self) -> int:
+    def structural_rank(self) -> int:
         """Number of combinations of errors that readings without noise would determine."""
         return len(self.free) if self.base else self.identifiability.structural_rank
 

@@ -44,7 +44,7 @@ QUICK = {"solver": "variable-projection"}
 UNITS = ("_mm", "_um", "_mrad", "_deg")
 
 PURE = {
-    *("cycle", "finer", "ratio", "tolerance_scale", "log_likelihood_ratio", "log_evidence"),
+    *("cycle", "finer", "ratio", "tolerance_scale", "log_posterior_odds", "log_evidence"),
     "log_evidence_against_chosen",
     *("independent_readings", "parameters", "chance", "part_of_std", "readings", "missing"),
     *("largest_change_over_std",),

@@ -186,7 +186,7 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     if others:
         listed = ";\n  ".join(dict.fromkeys([_text(session, e), *others]))
         text = f"One of these may have happened:\n  {listed}."
-    numbers = {"log_likelihood_ratio": anomaly.log_evidence}
+    numbers = {"log_posterior_odds": anomaly.log_evidence}
     if e.amount is not None:
         for name in e.parameters:
             p = session.robot.parameters[name]
@@ -262,7 +262,7 @@ def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
     return {
         "before_rms_um": result.rms_before / UM,
         "after_rms_um": result.rms_after / UM,
-        "log_likelihood_ratio": anomaly.log_evidence,
+        "log_posterior_odds": anomaly.log_evidence,
     }
 
 
@@ -277,8 +277,8 @@ def describe_evidence(finding: Finding) -> str:
     before, after = (numbers.get(f"{n}_rms_um", math.nan) * UM for n in ("before", "after"))
     if math.isfinite(before + after) and finding.kind != "stuck dial":
         sentences.append(f"Residual {um(before)} µm RMS as written, {um(after)} µm once corrected.")
-    if "log_likelihood_ratio" in numbers:
-        odds = math.exp(min(numbers["log_likelihood_ratio"], math.log(LARGEST_ODDS)))
+    if "log_posterior_odds" in numbers:
+        odds = math.exp(min(numbers["log_posterior_odds"], math.log(LARGEST_ODDS)))
         number = f"{float(f'{odds:.3g}'):,.0f}"
         if odds > 0.999 * LARGEST_ODDS:
             number = f"more than {LARGEST_ODDS:,.0f}"

@@ -163,7 +163,7 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     nuisance, checks = round(spectrum.n_nuisance, 1), round(calibration.redundancy, 1)
     of_sensors = f", {nuisance:g} the nuisance parameters of the gauges" if nuisance else ""
     lines.append(
-        f"{counted(spectrum.n_readings, 'independent reading')}: {calibration.rank} determine the "
+        f"{counted(spectrum.n_readings, 'independent reading')}: {calibration.structural_rank} determine the "
         f"errors of the machine{of_sensors}, {f'{checks:g}' if checks else 'none'} check the model."
     )
     if spectrum.rank:
