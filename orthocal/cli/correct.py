@@ -94,7 +94,8 @@ class CorrectionOptions:
         offsets: Offsets in the controller when the program runs: those that `calibrate` says to
             enter, or those that were active during the measurement.
         backlash: Who takes up identified backlash: the program, or the controller (LinuxCNC:
-            BACKLASH).
+            BACKLASH). Default: the controller, which has the values to enter; with --offsets active
+            the program, except for the part that the controller compensates already.
         work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
         start_mm (X,Y,Z): Position that the controller displays before the program. Without it,
             rapid motions before the first position in X, Y and Z are not corrected.
@@ -102,7 +103,7 @@ class CorrectionOptions:
 
     within: Annotated[float, Option(min=0.01, max=1000.0)] = 1.0
     offsets: Offsets = Offsets.ENTERED
-    backlash: Backlash = Backlash.PROGRAM
+    backlash: Backlash | None = None
     work_offset_mm: list[str] | None = None
     start_mm: str | None = None
     tool: ToolTip = None
@@ -274,7 +275,8 @@ def _prepare(
     )
     region, words = _find_region(result)
     lags = _find_lags(result)
-    by_program = options.backlash is Backlash.PROGRAM and bool(lags.any())
+    usual = Backlash.PROGRAM if active else Backlash.CONTROLLER
+    by_program = (options.backlash or usual) is Backlash.PROGRAM and bool(lags.any())
     sides = ApproachSides(result, values, lags) if by_program else None
     return _Correction(
         result=result,
@@ -498,14 +500,16 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
         lags: Half of the backlash to be compensated, shape (n_drives,), [m, rad].
         by_program: Whether the program compensates it, not the controller.
     """
+    from orthocal.assessment.controller_entries import backlash_changes, find_backlash
     from orthocal.effects.compensation import describe_trims
 
-    if not lags.any():
-        return ""
+    backlash = 2.0 * lags
+    if not by_program:
+        backlash = result.compensated_backlash + backlash_changes(result, find_backlash(result))
     listed = []
-    for drive, lag in zip(result.robot.drives, lags.tolist(), strict=True):
+    for drive, value in zip(result.robot.drives, backlash.tolist(), strict=True):
         unit, factor = DRIVE_UNITS[drive.unit]
-        shown = format_fixed(2.0 * lag / factor, 3)
+        shown = format_fixed(value / factor, 3)
         if float(shown):
             listed.append(f"{drive.name} {shown} {unit}")
     if not listed:
@@ -518,7 +522,8 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
     if by_program:
         text = f"Where drives reverse, the program takes up their backlash: {', '.join(listed)}."
         return f"{text} The controller must not compensate it."
-    return f"The controller must compensate the backlash of the drives: {', '.join(listed)}."
+    text = f"The controller must compensate the backlash of the drives: {', '.join(listed)}."
+    return f"{text} If it cannot, use --backlash program."
 
 
 def _find_lags(result: orthocal.Calibration) -> Array:

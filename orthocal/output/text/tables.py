@@ -162,9 +162,10 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
         ]
     nuisance, checks = round(spectrum.n_nuisance, 1), round(calibration.redundancy, 1)
     of_sensors = f", {nuisance:g} the nuisance parameters of the gauges" if nuisance else ""
+    readings = counted(spectrum.n_readings, "independent reading")
     lines.append(
-        f"{counted(spectrum.n_readings, 'independent reading')}: {calibration.structural_rank} determine the "
-        f"errors of the machine{of_sensors}, {f'{checks:g}' if checks else 'none'} check the model."
+        f"{readings}: {calibration.structural_rank} determine the errors of the machine"
+        f"{of_sensors}, {f'{checks:g}' if checks else 'none'} check the model."
     )
     if spectrum.rank:
         o = spectrum.observability
