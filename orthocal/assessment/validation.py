@@ -20,6 +20,7 @@ from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import (
     entered_offsets,
     expanded_uncertainty,
+    find_backlash,
     find_entries,
 )
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
@@ -39,6 +40,7 @@ from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
     EXIT_CODES,
     Assessment,
+    BacklashEntry,
     ControllerEntry,
     Decision,
     Finding,
@@ -129,6 +131,8 @@ class Validation:
     """Values to enter. Those of the calibration if they were entered wrongly, or if the joint
     calibration changes none of them; those of the joint calibration if it changes them. Empty if
     the calibration is not confirmed for another reason."""
+    enter_backlash: tuple[BacklashEntry, ...]
+    """Backlash of the calibration, if numbers were entered wrongly; otherwise empty."""
     repetition: Repetition
     """Correlation of the residuals of both fits."""
     assessment: Assessment
@@ -242,7 +246,8 @@ def validate_calibration(
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
     unchanged = all(one.firmware == calibration.session.firmware for one in new)
-    entries, notes = _choose_entries(calibration, joint, all_sessions, mistake, unchanged=unchanged)
+    wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
+    entries, notes = _choose_entries(calibration, joint, wrongly=wrongly, unchanged=unchanged)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, judgement, stated=stated)
@@ -256,6 +261,7 @@ def validate_calibration(
         joint=joint,
         mistake=mistake,
         enter=entries,
+        enter_backlash=find_backlash(calibration) if wrongly else (),
         repetition=repetition,
         assessment=Assessment(
             _decide(confirmed, findings, agreement),
@@ -493,9 +499,8 @@ def _describe_agreement(
 def _choose_entries(
     calibration: Calibration,
     joint: Calibration | None,
-    all_sessions: Session,
-    mistake: Anomaly | None,
     *,
+    wrongly: bool,
     unchanged: bool,
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
     """Values to enter after the new readings, and findings about them.
@@ -505,12 +510,10 @@ def _choose_entries(
     Args:
         calibration: The validated calibration.
         joint: Joint calibration; None if the calibration is not confirmed.
-        all_sessions: All sessions.
-        mistake: Change between the sessions; None without any.
+        wrongly: Whether the values of the calibration were entered wrongly.
         unchanged: Whether the new sessions state the settings of the calibration's firmware.
     """
     if joint is None:
-        wrongly = _is_wrongly_entered(all_sessions, mistake)
         return (find_entries(calibration) if wrongly else ()), []
     assessment, findings = assessment_of(joint), _find_further_change(joint, unchanged=unchanged)
     entries = assessment.entries if findings else find_entries(calibration)

@@ -393,6 +393,12 @@ def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, cali
     code, taken_up, _ = run_orthocal(folder, *words[:-2])
     assert code == 0
     assert any("The controller must not compensate" in c for c in head(taken_up))
+    # with the values to enter, the controller compensates the backlash, unless it cannot
+    entered = words[:4]
+    for option, part in (((), "must compensate"), (("--backlash", "program"), "must not")):
+        code, text, _ = run_orthocal(folder, *entered, *option)
+        assert code == 0
+        assert any(f"controller {part}" in c.lower() for c in head(text))
 
     def last(text):
         line = text.strip().splitlines()[-1]

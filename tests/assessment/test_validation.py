@@ -489,6 +489,10 @@ def test_values_to_enter_after_a_backlash_that_was_not_entered():
     assert json.loads(result_json(result))["mistake"]["active"] == [0.0] * 3
     found = [e.enter for e in result.enter]
     assert found == pytest.approx(entered_offsets(calibration).tolist())
+    backlash = [round(e.enter, 6) for e in result.enter_backlash]
+    assert backlash == pytest.approx([t.backlash for t in compensation_to_enter(calibration)])
+    text = summarize(result)
+    assert [f"{d.name} backlash" in text for d in plan.robot.drives] == [True] * 3
 
 
 def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(plan):

@@ -28,6 +28,7 @@ from orthocal.output.text.layout import (
     bullets,
     mm,
     noted,
+    plain,
     residual_table,
     section,
     signed,
@@ -85,6 +86,11 @@ def render_validation(
     ]
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
+        rows += [
+            (f"{e.drive} backlash", plain(e.enter * e.edge_factor), e.edge_unit)
+            for e in validation.enter_backlash
+            if e.change
+        ]
         table = table_of(("drive", "new", "unit"), rows)
         note = f"new: total offset. {CONVERTED}"
         parts.append(section("Values to enter", noted(table, note)))
