@@ -62,15 +62,16 @@ def sheet(
 def sheet_or_problem(
     session: orthocal.Session, *, following: str = ""
 ) -> tuple[dict[str, str], str]:
-    """Text of the files of the measuring sheet by name, or no files and the reason.
+    """Text of the files of a new session's measuring sheet by name, or no files and the reason.
 
     Args:
-        session: The plan.
+        session: The plan, before `write_session` writes it.
         following: Command for the readings; see `sheet_files`.
     """
+    from orthocal.measurement.files.write_session import number_rows
     from orthocal.output.sheet.page import sheet_files
 
     try:
-        return sheet_files(session, following=following), ""
+        return sheet_files(number_rows(session), following=following), ""
     except OrthocalError as e:
         return {}, f"orthocal: no measuring sheet: {e}"
