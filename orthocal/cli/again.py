@@ -21,7 +21,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheet import sheet_or_problem
+from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.files import exists
 from orthocal.units import MM
@@ -56,7 +56,7 @@ def again(
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
             BACKLASH and COMP_FILE the session then states; default: the backlash to enter, and the
-            tables of the last session.
+            tables of the last session. Motions beyond its soft limits are named.
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import note_wrong_order, require_entering
@@ -85,6 +85,7 @@ def again(
         put_out(f"Set these adjustments before you measure: {settings}.")
     put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
     _note_other_lines(result, new, ini, joints)
+    note_beyond_limits(new, ini)
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
