@@ -207,6 +207,8 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     assert entered == pytest.approx(np.round(identified, 6), abs=1e-12)
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
     assert "instead of" not in done.stderr
+    assert f"The lines of {words[-1]} contain them: enter these lines" in done.stdout
+    assert "HOME_OFFSET" not in done.stdout
 
 
 def program_joints(folder):
@@ -291,4 +293,6 @@ def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     assert any(e.change for e in entries)
     stated = [trim.backlash for trim in second.compensation]
     assert stated == pytest.approx([e.active + e.change for e in entries], abs=5e-7)
+    export = f"`orthocal export {one} --to linuxcnc --offsets --ini FILE --out DIRECTORY`"
+    assert f"Do not type them as HOME_OFFSET: {export} writes" in done.stdout
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
