@@ -179,6 +179,28 @@ def test_again_writes_the_same_plan_with_active_offsets(calibrated, experiment, 
     assert err == f"orthocal: {out}/session.yaml: exists already; --force overwrites it\n"
 
 
+def test_sheet_and_programs_have_the_lines_of_the_new_table(calibrated, experiment, tmp_path):
+    """A deleted row leaves a blank line, and the new table has none."""
+    shutil.copytree(experiment, tmp_path / "first")
+    table = tmp_path / "first/readings.csv"
+    head, *rows = table.read_text().splitlines(keepends=True)
+    table.write_text("".join([head, *rows[:4], "\n", *rows[4:7], "\n", *rows[7:]]))
+    out = tmp_path / "second"
+    words = ("again", calibrated, "--session", tmp_path / "first", "--out", out)
+    assert orthocal(*words).returncode == 0
+    rows = (out / "readings.csv").read_text().splitlines()
+    programmed = {}
+    for program in out.glob("*.ngc"):
+        text = program.read_text()
+        for line, posture in re.findall(r"\(reading line (\d+), posture (\w+)", text):
+            programmed[int(line)] = program.stem[3:], posture
+    expected = {i: tuple(row.split(",")[:2]) for i, row in enumerate(rows[1:], 2)}
+    assert programmed == expected
+    sheet = (out / "sheet.html").read_text()
+    printed = re.findall(r'<tr[^>]*><td class="number">(\d+)</td>', sheet)
+    assert set(map(int, printed)) == set(expected)
+
+
 def test_offsets_are_changes_if_no_session_states_the_active_ones(experiment, tmp_path):
     """Entered as total offsets they would replace those of the controller."""
     first = tmp_path / "first"

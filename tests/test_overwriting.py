@@ -74,6 +74,25 @@ def test_a_result_replaces_its_own_alone(folder, words):
             assert (out / name).read_bytes() == written[name]
 
 
+def test_lines_for_a_controller_are_not_replaced_by_others(folder):
+    """They record what was entered, and `again --ini` reads them."""
+    words = ("export", "one", "--to", "linuxcnc", "--out", "out")
+    homes = ("--home-offset", "75,-75,75")
+    assert run_orthocal(folder, *words, *homes).returncode == 0
+    lines = folder / "out/joints.ini"
+    entered = lines.read_text()
+    edited = entered.replace("HOME_OFFSET = ", "HOME_OFFSET = 1", 1)
+    for text, options in ((entered, ()), (edited, homes)):
+        lines.write_text(text)
+        before = {p.name: p.read_bytes() for p in (folder / "out").iterdir()}
+        done = run_orthocal(folder, *words, *options)
+        assert done.returncode == 2
+        assert "out/joints.ini: contains other lines" in done.stderr
+        assert {p.name: p.read_bytes() for p in (folder / "out").iterdir()} == before
+    assert run_orthocal(folder, *words, *homes, "--force").returncode == 0
+    assert lines.read_text() == entered
+
+
 def test_the_exported_robot_does_not_replace_the_nominal_one(folder, root):
     shutil.copytree(root / "robots/orthoglide", folder / "robot")
     done = run_orthocal(folder, "export", "one", "--to", "urdf", "--out", "robot")

@@ -19,6 +19,12 @@ MOST_ACTIONS = 3
 ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""
 
+OFFSETS_IN_LINUXCNC = (
+    "They are not HOME_OFFSET. In LinuxCNC, HOME_OFFSET must be that in the joints.ini of "
+    "`orthocal export`, whose comment `controller` states these offsets."
+)
+"""Sentences about the place where LinuxCNC users find the offsets of a session."""
+
 
 def _finding(
     severity: Severity,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,13 +21,15 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheet import sheet_or_problem
+from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.files import exists
 from orthocal.units import MM
 
 if TYPE_CHECKING:
+    from orthocal.arrays import Array
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
+    from orthocal.robot.model import Drive
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
@@ -56,10 +58,11 @@ def again(
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
             BACKLASH and COMP_FILE the session then states; default: the backlash to enter, and the
-            tables of the last session.
+            tables of the last session. Motions beyond its soft limits are named.
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import note_wrong_order, require_entering
+    from orthocal.export.linuxcnc.entered_lines import states_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
     from orthocal.output.text.answer import quote_path
 
@@ -83,8 +86,10 @@ def again(
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
-    put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
+    entered = joints is not None and states_offsets(joints.offsets, new.active_offsets)
+    put_out(_describe_entries(new, result, calibration, ini=ini if entered else None))
     _note_other_lines(result, new, ini, joints)
+    note_beyond_limits(new, ini)
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
@@ -144,35 +149,83 @@ def _note_other_lines(
         put_note(differences)
 
 
-def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
+def _describe_entries(
+    new: orthocal.Session, calibration: orthocal.Calibration, path: Path, *, ini: Path | None
+) -> str:
     """Instructions about the corrections of the controller for a new session.
 
     Args:
         new: The session.
-        changes: Whether its offsets are changes of the active offsets, which are not known.
+        calibration: The calibration that it repeats.
+        path: Path of this calibration.
+        ini: INI file whose lines contain the offsets of the session; None if no file is known to.
     """
     from orthocal.effects.compensation import describe_trims
 
-    offsets = ", ".join(
-        f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
-        for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
-    )
-    text = f"Enter these offsets of the drives, unless they are entered already: {offsets}."
-    if changes:
+    drives = new.robot.drives
+    offsets = _list_lengths(drives, new.active_offsets)
+    text = f"The controller must correct these total offsets of the drives: {offsets}."
+    if calibration.session.controller_offsets is None:
         text = (
             f"Add these to the active offsets of the drives, unless they are added already: "
             f"{offsets}. The new session.yaml states these changes, since the calibrated session "
             "states no offsets (`controller`)."
         )
-    if down := [d.name for d in new.robot.drives if d.direction < 0]:
-        they = "it counts" if len(down) == 1 else "they count"
-        text += f" In the controller the sign is opposite for {', '.join(down)}: {they} down."
+    if ini is not None:
+        text += f" The lines of {ini} contain them: enter these lines, unless you have already."
+    else:
+        text += f" Do not type them as HOME_OFFSET: {_describe_conversion(new, calibration, path)}"
+        if down := [d.name for d in drives if d.direction < 0]:
+            they = "it counts" if len(down) == 1 else "they count"
+            text += (
+                f" In another controller the sign is opposite for {', '.join(down)}: {they} down."
+            )
     if backlash := describe_trims(new.robot, new.compensation):
         text += (
             f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "
             "remove it from `controller` in session.yaml."
         )
     return f"{text}\nThen home, measure and compare:"
+
+
+def _describe_conversion(
+    new: orthocal.Session, calibration: orthocal.Calibration, path: Path
+) -> str:
+    """Clause about the way from the offsets of a new session to HOME_OFFSET.
+
+    An export contains no adjustments that were made since the calibration.
+
+    Args:
+        new: The session.
+        calibration: The calibration that it repeats.
+        path: Path of this calibration.
+    """
+    from orthocal.effects.compensation import compensates_alike
+    from orthocal.output.text.answer import quote_path
+
+    if dict(new.adjusted) == dict(calibration.session.adjusted):
+        return (
+            f"`orthocal export {quote_path(path)} --to linuxcnc --offsets --ini FILE --out "
+            "DIRECTORY` writes the lines that contain them, unless you have entered them already."
+        )
+    drives = new.robot.drives
+    changes = (new.active_offsets - calibration.active_offsets) * [d.direction for d in drives]
+    text = f"it changes by {_list_lengths(drives, changes)} since the calibrated measurement"
+    same = compensates_alike(new.compensation, calibration.session.compensation)
+    return f"{text}{'' if same else ', and by half of the change of BACKLASH'}."
+
+
+def _list_lengths(drives: Sequence[Drive], values: Array) -> str:
+    """Values of drives with their names and units.
+
+    Args:
+        drives: The drives.
+        values: Shape (n_drives,), [m, rad].
+    """
+    return ", ".join(
+        f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
+        for d, v in zip(drives, values.tolist(), strict=True)
+    )
 
 
 def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:

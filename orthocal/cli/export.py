@@ -21,7 +21,11 @@ from orthocal.cli.options import (
     read_numbers,
     read_vector,
 )
-from orthocal.cli.overwriting import mark_written, require_replaceable_results
+from orthocal.cli.overwriting import (
+    mark_written,
+    require_replaceable_results,
+    require_same_text,
+)
 from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
@@ -84,9 +88,9 @@ def export(
         payload=payload,
         module=module,
     )
-    files = orthocal.export_calibration(result, to, anyway=anyway, options=options)
+    files = mark_written(orthocal.export_calibration(result, to, anyway=anyway, options=options))
     _require_free(out, files, force=force)
-    write_results(out, mark_written(files))
+    write_results(out, files)
     if result.session.firmware is not None:
         _show_settings(result, to, calibration, out)
     if "kinematics.ini" in files:
@@ -159,7 +163,7 @@ def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> N
 
 
 def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
-    """Refuse a directory with files that orthocal did not write, or with an alternative file.
+    """Refuse a directory with an alternative file, other lines, or files of somebody else.
 
     Raises:
         OrthocalError: If there is such a file; names it.
@@ -172,6 +176,8 @@ def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
                 where=str(out / other),
             )
     require_replaceable_results(out, files, force=force)
+    if not force:
+        require_same_text(out, {name: files[name] for name in ALTERNATIVES if name in files})
 
 
 def _read_joints(

@@ -30,6 +30,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
+from orthocal.cli.sheet import note_beyond_limits
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
 
@@ -207,6 +208,7 @@ def new(
     design = _design(name, dimensions, options, controller)
     _write(folder, name, design)
     _report(folder, design)
+    note_beyond_limits(design.session, controller.ini)
     if design.assumed_tip:
         put_note(design.assumed_tip)
     if not design.tolerance_stated:

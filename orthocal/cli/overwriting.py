@@ -1,8 +1,8 @@
 """Rule for existing files that commands may overwrite.
 
-Results that orthocal wrote are replaced. With --force only, other files are overwritten, and those
-of a machine or a session, which users edit and fill in. Measured readings are never overwritten,
-even if their session cannot be loaded.
+Results that orthocal wrote are replaced. With --force only, other files are overwritten, those of a
+machine or a session, which users edit and fill in, and other lines for a controller, which record
+what was entered. Measured readings are never overwritten, even if their session cannot be loaded.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from orthocal.errors import OrthocalError, SessionError
-from orthocal.io.files import exists, require_writable, require_writable_file
+from orthocal.io.files import exists, read_file, require_writable, require_writable_file
 
 SIMULATED = "Simulated"
 """First word of the source of a simulated session."""
@@ -149,6 +149,26 @@ def require_replaceable_results(directory: Path, files: Mapping[str, str], *, fo
         is_table = path.suffix in TABLES and (marked or _has_header(path, text))
         if not (force or path in marked or is_table):
             raise _refusal(path)
+
+
+def require_same_text(directory: Path, files: Mapping[str, str]) -> None:
+    """Refuse to replace lines for a controller by others: they record what was entered.
+
+    Args:
+        directory: The directory; it need not exist.
+        files: Texts of the new files by name.
+
+    Raises:
+        OrthocalError: If an existing file is not empty and differs from the new one.
+    """
+    for name, text in files.items():
+        path = directory / name
+        if exists(path) and read_file(path, error=OrthocalError) not in (b"", text.encode()):
+            raise OrthocalError(
+                "contains other lines, which record what was entered in the controller; choose "
+                "another directory, or overwrite it by --force",
+                where=str(path),
+            )
 
 
 def require_replaceable_file(path: Path, *, force: bool, kinds: tuple[str, ...] = ()) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
+from pathlib import Path
 
 import orthocal
 from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command, read_numbers
 from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import put_note
-from orthocal.errors import OrthocalError
+from orthocal.errors import OrthocalError, SessionError
 from orthocal.io.files import is_folder, require_writable, write_files
 
 
@@ -20,6 +22,7 @@ def sheet(
     shift_mm: str = "0,0,0",
     dwell: float | None = None,
     trigger: str | None = None,
+    ini: Path | None = None,
     out: OptionalOutDirectory = None,
     force: Force = False,
 ) -> None:
@@ -37,6 +40,7 @@ def sheet(
         dwell (SECONDS): Time at each reading instead of a pause (G4).
         trigger (OUTPUT): Trigger of a logger after the dwell (default: 1 s): digital output 0 to
             63 (M64, M65 of LinuxCNC), or an M-code from M100 to M199.
+        ini (FILE): INI file of LinuxCNC; motions beyond its soft limits are named.
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
@@ -57,20 +61,40 @@ def sheet(
     count = len(files) - 1
     programs = f" and {count} programs" if count else "; no programs: the drives control no tool"
     put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
+    note_beyond_limits(plan, ini)
 
 
 def sheet_or_problem(
     session: orthocal.Session, *, following: str = ""
 ) -> tuple[dict[str, str], str]:
-    """Text of the files of the measuring sheet by name, or no files and the reason.
+    """Text of the files of a new session's measuring sheet by name, or no files and the reason.
 
     Args:
-        session: The plan.
+        session: The plan, before `write_session` writes it.
         following: Command for the readings; see `sheet_files`.
     """
+    from orthocal.measurement.files.write_session import number_rows
     from orthocal.output.sheet.page import sheet_files
 
     try:
-        return sheet_files(session, following=following), ""
+        return sheet_files(number_rows(session), following=following), ""
     except OrthocalError as e:
         return {}, f"orthocal: no measuring sheet: {e}"
+
+
+def note_beyond_limits(session: orthocal.Session, ini: Path | None) -> None:
+    """Note motions of a new session's programs beyond the soft limits of an INI file.
+
+    Args:
+        session: The plan.
+        ini: The INI file of LinuxCNC; None without one.
+    """
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+    from orthocal.output.sheet.soft_limits import describe_beyond_limits
+
+    if ini is None:
+        return
+    limits = read_controller_joints(ini, session.robot).limits
+    with suppress(SessionError):  # no measuring sheet, whose reason is printed
+        if text := describe_beyond_limits(session, limits, file=str(ini)):
+            put_note(text)

@@ -256,6 +256,8 @@ def test_command_and_report_list_the_planned_adjustments(machines, tmp_path):
         code, _, err = run("again", tmp_path, "--adjusted", amounts, "--out", new)
         assert code == 2
         assert "--adjusted" in err
-    code, _, _ = run("again", tmp_path, "--adjusted", f"{names[0]}=0.12", "--out", new)
+    code, out, _ = run("again", tmp_path, "--adjusted", f"{names[0]}=0.12", "--out", new)
     assert code == 0
+    assert "Do not type them as HOME_OFFSET: it changes by " in out
+    assert "orthocal export" not in out  # which knows no adjustments
     assert f"adjusted_mm: {{{names[0]}: 0.12}}" in (new / "session.yaml").read_text()

@@ -8,6 +8,7 @@ import pytest
 
 from orthocal import load_session
 from orthocal.assessment.words.anomalies import _text, describe_anomalies
+from orthocal.assessment.words.remedies import advise_about_sessions
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
 
 
@@ -33,6 +34,21 @@ def test_every_kind_has_a_sentence(root, kind):
         parameters=(f"{drive}.offset",),
     )
     assert len(_text(session, explanation).split()) > 3
+
+
+def test_offsets_of_a_session_are_not_compared_with_home_offset(root):
+    """LinuxCNC displays no number that equals them; backlash is BACKLASH."""
+    session = load_session(root / "examples/raw-cycles")
+    drive = session.robot.drives[0].name
+    for kind, key, differs in (
+        ("offsets not entered", "controller.offsets_mm", True),
+        ("backlash halved", "controller.backlash_mm", False),
+    ):
+        explanation = Explanation(kind, "session", drives=(drive,), sessions=("second",))
+        action = advise_about_sessions(session, explanation)
+        assert f"`{key}` of session second" in action
+        assert ("They are not HOME_OFFSET." in action) == differs
+        assert ("joints.ini" in action) == differs
 
 
 def test_an_action_that_costs_no_reading_comes_first(root):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from calibrated import UNJUDGED
+from closed_form import inverse
 from commands import run_orthocal
 from effect_plans import write_plan
 
@@ -23,6 +25,9 @@ from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.units import DEG
 
 MM = 1e-3
+
+LEG = 310.25e-3
+"""Length of the legs of the packaged Orthoglide, [m]."""
 
 INI = """# a machine
 [TRAJ]
@@ -202,6 +207,47 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     assert entered == pytest.approx(np.round(identified, 6), abs=1e-12)
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
     assert "instead of" not in done.stderr
+    assert f"The lines of {words[-1]} contain them: enter these lines" in done.stdout
+    assert "HOME_OFFSET" not in done.stdout
+
+
+def program_joints(folder):
+    """Joints on the straight lines of the programs, by the closed form, shape (n, 3), [mm]."""
+    rows = []
+    for program in folder.glob("*.ngc"):
+        words = re.findall(r"(?m)^G53 G1 X(\S+) Y(\S+) Z(\S+)", program.read_text())
+        points = np.array([np.zeros(3), *np.array(words, dtype=float)])
+        share = np.linspace(0.0, 1.0, 200)[:, None]
+        for start, end in pairwise(points):
+            rows.append(inverse((start + share * (end - start)) * MM, length=LEG) / MM)
+    return np.concatenate(rows)
+
+
+def test_again_names_motions_beyond_the_soft_limits_of_the_file(folder, one, plain):
+    """Also those of an approach: the posture itself may be within the limits."""
+    run_orthocal(folder, "again", one, "--out", "free", "--ini", plain)
+    joints = program_joints(folder / "free")
+    highest, lowest = joints[:, 1].max(), joints[:, 1].min()
+    for excess in (-0.01, 0.01):
+        own = f"[JOINT_1]\nMIN_LIMIT = {lowest + excess}\nMAX_LIMIT = {highest - excess}\n"
+        (folder / "narrow.ini").write_text(plain.read_text().replace("[JOINT_1]\n", own))
+        out = "beyond" if excess > 0 else "within"
+        done = run_orthocal(folder, "again", one, "--out", out, "--ini", "narrow.ini")
+        assert done.returncode == 0
+        assert ("narrow.ini: the controller refuses" in done.stderr) == (excess > 0)
+    named = re.findall(
+        r"JOINT_(\d) \((\w+)\), (M.._LIMIT) (\S+) mm: (.*) reaches (\S+) mm", done.stderr
+    )
+    assert [(n, drive, key) for n, drive, key, *_ in named] == [
+        ("1", "y_slide", "MIN_LIMIT"),
+        ("1", "y_slide", "MAX_LIMIT"),
+    ]
+    numbers = np.array([[float(limit), float(reached)] for *_, limit, _, reached in named])
+    expected = np.array([[lowest + 0.01, lowest], [highest - 0.01, highest]])
+    assert numbers == pytest.approx(expected, abs=1e-3)
+    rows = (folder / "beyond/readings.csv").read_text().splitlines()
+    setups = {row.partition(",")[0] for row in rows}
+    assert all(place.partition(" ")[0] in setups for *_, place, _ in named)
 
 
 def test_again_says_what_differs_in_the_file_of_another_calibration(folder, one, plain):
@@ -247,4 +293,6 @@ def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     assert any(e.change for e in entries)
     stated = [trim.backlash for trim in second.compensation]
     assert stated == pytest.approx([e.active + e.change for e in entries], abs=5e-7)
+    export = f"`orthocal export {one} --to linuxcnc --offsets --ini FILE --out DIRECTORY`"
+    assert f"Do not type them as HOME_OFFSET: {export} writes" in done.stdout
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from orthocal.assessment.wording import joined
+from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
@@ -158,10 +158,11 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
         number = "backlash" if e.kind.startswith("backlash") else "offsets"
         key = f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
         which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
-        by_factor = e.kind in ("backlash halved", "backlash entered twice")
-        complete = " LinuxCNC's BACKLASH is the complete backlash." * by_factor
+        note = f" {OFFSETS_IN_LINUXCNC}" if number == "offsets" else ""
+        if e.kind in ("backlash halved", "backlash entered twice"):
+            note = " LinuxCNC's BACKLASH is the complete backlash."
         return (
-            f"Compare the {number} in the controller with `{key}` of {which}.{complete} If the "
+            f"Compare the {number} in the controller with `{key}` of {which}.{note} If the "
             "session states wrong numbers, correct them there; otherwise enter the right ones and "
             "measure again."
         )

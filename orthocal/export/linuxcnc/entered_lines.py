@@ -33,6 +33,16 @@ def find_unstated_tables(calibration: Calibration, stated: Compensation) -> tupl
     )
 
 
+def states_offsets(offsets: Sequence[float] | None, entered: Array) -> bool:
+    """True if the comment of exported lines states the offsets of a session.
+
+    Args:
+        offsets: Offsets of the comment, [m, rad]; None without it.
+        entered: Offsets of the session, shape (n_drives,), [m, rad].
+    """
+    return offsets is not None and bool(np.abs(np.array(offsets) - entered).max() <= SAME_OFFSET)
+
+
 def describe_other_lines(
     calibration: Calibration,
     compensation: Compensation,
@@ -56,7 +66,7 @@ def describe_other_lines(
         Sentences; "" without a difference.
     """
     sentences = []
-    if offsets is not None and np.abs(np.array(offsets) - entered).max() > SAME_OFFSET:
+    if offsets is not None and not states_offsets(offsets, entered):
         values = joined(
             [
                 f"{d.name} {_show(d, v, '+.3f')} instead of {_show(d, e, '+.3f')}"
@@ -66,7 +76,7 @@ def describe_other_lines(
         )
         sentences.append(
             f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
-            f"{values}. Enter those of the session, or use the lines of this calibration's export."
+            f"{values}. Enter the lines of this calibration's export."
         )
     if differences := compare_joints(_pair_trims(calibration, compensation)):
         sentences.append(

@@ -21,6 +21,7 @@ from orthocal.measurement.files.point_rows import (
 )
 from orthocal.measurement.files.readings_file import (
     COLUMN_OF_ROLE,
+    FIRST_LINE,
     REQUIRED,
     REQUIRED_OF_POINTS,
     RawReading,
@@ -240,6 +241,16 @@ def _place_robot(session: Session, folder: Path) -> str:
     for name, content in robot.content.items():
         write_file(target / name, content)
     return f"./{robot.name}"
+
+
+def number_rows(session: Session) -> Session:
+    """Session whose rows have the lines that `write_session` gives them.
+
+    Rows of an earlier session have its lines, with gaps where a row was deleted.
+    """
+    lines = enumerate(gather_points(session.readings, session.setups), FIRST_LINE)
+    readings = tuple(replace(r, line=line) for line, group in lines for r in group)
+    return replace(session, readings=readings)
 
 
 def readings_table(

@@ -132,6 +132,9 @@ class Stop:
     """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
     expected: float = 0.0
     """Reading of the nominal machine, relative to the first reading, [m]."""
+    path: Array | None = None
+    """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
+    do not command the tool."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -650,5 +653,6 @@ def _predict(
             elif np.abs(on_path).max() > half_range:
                 largest = f"{on_path[np.abs(on_path).argmax()] / MM:+.1f}".replace("-", "−")
                 lift = f"the dial would go {largest} mm"
-        finished.append(replace(stop, lift=lift, expected=float(relative[end - 1])))
+        expected = float(relative[end - 1])
+        finished.append(replace(stop, lift=lift, expected=expected, path=paths[i].drives))
     return finished

@@ -9,7 +9,7 @@ from importlib import resources
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.wording import name_direction
+from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, name_direction
 from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
@@ -491,7 +491,7 @@ def _active_offsets(session: Session) -> str:
     )
     return (
         f"Check that these offsets of a calibration are entered, as session.yaml states: {active}. "
-        "Do not change them until all readings are taken."
+        f"{OFFSETS_IN_LINUXCNC} Do not change them until all readings are taken."
     )
 
 
