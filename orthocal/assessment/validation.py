@@ -245,9 +245,8 @@ def validate_calibration(
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
-    unchanged = all(one.firmware == calibration.session.firmware for one in new)
     wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
-    entries, notes = _choose_entries(calibration, joint, wrongly=wrongly, unchanged=unchanged)
+    entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, judgement, stated=stated)
@@ -499,9 +498,9 @@ def _describe_agreement(
 def _choose_entries(
     calibration: Calibration,
     joint: Calibration | None,
+    new: Sequence[Session],
     *,
     wrongly: bool,
-    unchanged: bool,
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
     """Values to enter after the new readings, and findings about them.
 
@@ -510,11 +509,12 @@ def _choose_entries(
     Args:
         calibration: The validated calibration.
         joint: Joint calibration; None if the calibration is not confirmed.
+        new: The new sessions.
         wrongly: Whether the values of the calibration were entered wrongly.
-        unchanged: Whether the new sessions state the settings of the calibration's firmware.
     """
     if joint is None:
         return (find_entries(calibration) if wrongly else ()), []
+    unchanged = all(one.firmware == calibration.session.firmware for one in new)
     assessment, findings = assessment_of(joint), _find_further_change(joint, unchanged=unchanged)
     entries = assessment.entries if findings else find_entries(calibration)
     return entries, [*findings, *assessment.of_kind(*ENTRY_KINDS)]
