@@ -221,8 +221,7 @@ def validate_calibration(
         calibration: The calibration whose offsets were entered.
         sessions: Sessions measured with these offsets active, which is assumed if a session states
             none. Adjustments that they state change the predicted readings.
-        tolerances: Tolerances as in `Choice`, for the judgement of the new sessions and of changes,
-            not for the predictions.
+        tolerances: Tolerances as in `Choice`, for the judgement of new readings and changes alone.
 
     Raises:
         SessionError: If a session is of another robot, states other offsets, or belongs to the
