@@ -80,7 +80,8 @@ def test_a_new_directory_has_all_files(made):
     assert session.controller_offsets.tolist() == [0.0, 0.0, 0.0]
     assert session.robot.sha256 == robot.sha256
     commands = etree.HTML((made / "first/sheet.html").read_text()).xpath("//code/text()")
-    assert commands[-1] == "orthocal calibrate ."
+    assert commands[-1] == "orthocal calibrate . --out ../first-calibration"
+    assert f"# {commands[-1]}\n" in (made / "first/session.yaml").read_text()
     assert session.purpose == Purpose("full")
 
 

@@ -123,7 +123,7 @@ def test_readings_typed_over_a_pipe_are_those_of_the_example(root, run, tmp_path
     code, out, err = run(folder, *typed)
     assert (code, err) == (0, "")
     assert "All readings are recorded.\nEnter ends; `back` corrects.\n" in out
-    assert out.rstrip().endswith(f"Next:\n  orthocal calibrate {folder}")
+    assert out.endswith(f"Next:\n  orthocal calibrate {folder} --out {folder}-calibration\n")
     assert not WARNING.search(out)
     values = [r.value for r in load_session(folder).readings]
     assert values == pytest.approx([r.value for r in load_session(example).readings], abs=1e-12)
@@ -135,7 +135,8 @@ def test_session_with_active_offsets_is_to_be_validated(folder, run):
     _, out, _ = run(folder, *sound_readings(folder))
     assert "All 6 readings are recorded." in out
     assert f"by their calibration,\n  orthocal validate CALIBRATION {folder}\n" in out
-    assert out.rstrip().endswith(f"sessions together:\n  orthocal calibrate EARLIER {folder}")
+    together = f"orthocal calibrate EARLIER {folder} --out {folder}-calibration"
+    assert out.rstrip().endswith(f"sessions together:\n  {together}")
     with (folder / "session.yaml").open("a") as stream:
         stream.write("offsets_from: ../out/one\n")
     entered = folder.parent / "out/one"
@@ -751,7 +752,7 @@ def test_no_condition_is_asked_for_without_effects(folder, run):
     assert code == 0
     assert "Temperature of" not in out
     assert "From which side" not in out
-    assert out.endswith(f"Next:\n  orthocal calibrate {folder}\n")
+    assert out.endswith(f"Next:\n  orthocal calibrate {folder} --out {folder}-calibration\n")
     assert (folder / "readings.csv").read_text().startswith("setup,posture,reading_mm\n")
 
 

@@ -160,3 +160,22 @@ def test_in_python_the_argument_is_the_key(folder):
     assert (
         compare_models(plain, models=["offsets"], tolerances=STATED).judgement.verdict == "reject"
     )
+
+
+@pytest.mark.parametrize(
+    ("session", "typed_in", "expected"),
+    [
+        ("mill/first", None, "mill/first --out mill/first-calibration"),
+        ("mill/first/session.yaml", None, "mill/first/session.yaml --out mill/first-calibration"),
+        (".", None, ". --out ../first-calibration"),
+        ("session.yaml", None, "session.yaml --out ../first-calibration"),
+        ("mill/first", "mill/first", ". --out ../first-calibration"),
+        ("mill/first", "mill/sheets", "../first --out ../first-calibration"),
+    ],
+)
+def test_a_calibration_is_beside_its_session(tmp_path, monkeypatch, session, typed_in, expected):
+    """The printed commands are equal inside and outside of the session's directory."""
+    (tmp_path / "mill/first").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path if session.startswith("mill") else tmp_path / "mill/first")
+    folder = None if typed_in is None else Path(typed_in)
+    assert calibrate_command([Path(session)], {}, folder=folder) == f"orthocal calibrate {expected}"

@@ -30,7 +30,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheet import note_beyond_limits
+from orthocal.cli.sheet import following_command, note_beyond_limits
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
 
@@ -61,7 +61,7 @@ BED_WORDS = (
 COMMENT = (
     "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
     "in readings.csv in its order. Then\n"
-    "orthocal calibrate .\n"
+    "{calibrating}\n"
     "offsets_mm: those that are active in the controller during the measurement.\n"
     "backlash_mm: the backlash that it compensates, 0 for none."
 )
@@ -305,7 +305,15 @@ def _write(folder: Path, name: str, design: _Design) -> None:
     write_files(folder, machine_files)
     robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(design.session, robot=robot, robot_reference=str(folder.resolve()))
-    orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=design.files, blank=True)
+    comment = COMMENT.format(calibrating=_calibrating())
+    orthocal.write_session(session, folder / FIRST, comment=comment, extra=design.files, blank=True)
+
+
+def _calibrating() -> str:
+    """Command that calibrates from the first session, in its directory."""
+    from orthocal.output.text.answer import calibrate_command
+
+    return calibrate_command([Path(FIRST)], {}, folder=Path(FIRST))
 
 
 def _make_trial(
@@ -462,13 +470,13 @@ def _draw(
     drawn: dict[str, str] = {}
     if isinstance(plan, orthocal.MeasuringPlan):
         drawn = {"plan.json": plan_json(plan), "plan.svg": draw_plan(plan)}
-    return {**sheet_files(session), **drawn}
+    return {**sheet_files(session, following=_calibrating()), **drawn}
 
 
 def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.accuracy import describe_gains
-    from orthocal.output.text.answer import quote_path
+    from orthocal.output.text.answer import calibrate_command, quote_path
     from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import (
         describe_absent,
@@ -498,7 +506,7 @@ def _report(folder: Path, design: _Design) -> None:
         "Next: look at the machine, print the sheet, measure and calibrate:",
         f"  orthocal view {quote_path(folder)}",
         f"  orthocal record {quote_path(folder / FIRST)}",
-        f"  orthocal calibrate {quote_path(folder / FIRST)} --out {quote_path(folder / 'one')}",
+        f"  {calibrate_command([folder / FIRST], {})}",
     ]
     put_out("\n".join(lines))
 
@@ -562,7 +570,8 @@ def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
                 "time; its sheet is unchanged"
             )
             return []
-        write_files(sheet.parent, sheet_files(session))
+        following = following_command(session, sheet.parent, sheet.parent)
+        write_files(sheet.parent, sheet_files(session, following=following))
         put_out(f"Made {sheet} and its programs again.")
         return _changes_since(sheet.parent, robot)
     except OrthocalError as e:

@@ -44,17 +44,13 @@ def sheet(
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
-    from orthocal.output.text.answer import quote_path
 
     x, y, z = read_numbers(shift_mm, "--shift-mm", "XYZ")
     options = ProgramOptions(feed, approach_feed, (x, y, z), dwell, trigger)
     directory = out or (session if is_folder(session) else session.parent)
     require_writable(directory)
-    plan, following = orthocal.load_plan(session), ""
-    if plan.offsets_from is not None:
-        following = (
-            f"orthocal validate {quote_path(os.path.relpath(plan.offsets_from, directory))} ."
-        )
+    plan = orthocal.load_plan(session)
+    following = following_command(plan, session, directory)
     files = sheet_files(plan, options=options, following=following)
     require_replaceable_results(directory, files, force=force)
     write_files(directory, files)
@@ -62,6 +58,24 @@ def sheet(
     programs = f" and {count} programs" if count else "; no programs: the drives control no tool"
     put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
     note_beyond_limits(plan, ini)
+
+
+def following_command(plan: orthocal.Session, path: Path, directory: Path) -> str:
+    """Command for the readings of a written plan; "" if it needs a calibration that is not stated.
+
+    Args:
+        plan: The plan.
+        path: Path of its session.
+        directory: Directory in which the command is typed.
+    """
+    from orthocal.output.text.answer import calibrate_command, quote_path
+
+    if plan.offsets_from is not None:
+        entered = quote_path(os.path.relpath(plan.offsets_from, directory))
+        return f"orthocal validate {entered} {quote_path(os.path.relpath(path, directory))}"
+    if plan.active_offsets.any():
+        return ""
+    return calibrate_command([path], {}, folder=directory)
 
 
 def sheet_or_problem(

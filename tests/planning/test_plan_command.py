@@ -98,7 +98,7 @@ def test_the_plan_does_not_depend_on_the_number_of_processes(monkeypatch, tmp_pa
     monkeypatch.setattr(worker_pool, "can_fork", lambda: True)
     results = []
     for workers in (1, 2):
-        out = tmp_path / str(workers)
+        out = tmp_path / str(workers) / "plan"  # printed commands name its last part
         few = "--model offsets --hours 0.4".split()
         words = [*QUICK[:-1], 2, *few, "--workers", workers, "--out", out]
         code, text, err = run_orthocal(".", "plan", "orthoglide", *words)
@@ -175,6 +175,7 @@ def test_further_setups_of_a_session_are_planned(root, tmp_path):
     calibrating = ["orthocal", "calibrate", str(session), str(out), *option]
     assert shlex.split(err.splitlines()[-1]) == [*calibrating, "--out", f"{out}-calibration"]
     inside = f"orthocal calibrate {os.path.relpath(session, out)} . {shlex.join(option)}"
+    inside += " --out ../out-calibration"
     assert f"<code>{inside}</code>" in html.unescape((out / "sheet.html").read_text())
     assert f"# {inside}\n" in (out / "session.yaml").read_text()
     printed = " ".join(text.split())

@@ -119,7 +119,7 @@ def sheet_files(
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
     front = _front(session, motions, options, with_programs=bool(programs))
-    usual = "validate CALIBRATION ." if _is_corrected(session) else "calibrate ."
+    usual = "validate CALIBRATION ." if _is_corrected(session) else "calibrate . --out DIRECTORY"
     afterwards = _afterwards(session, following or f"orthocal {usual}")
     body = "\n".join([front, "".join(setups), afterwards])
     return {SHEET: page(title, style, body), **programs}

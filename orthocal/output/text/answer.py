@@ -301,16 +301,28 @@ def calibrate_command(
     Args:
         sessions: Directories of the sessions.
         tolerances: Tolerances that differ from those of the robot, by their keys.
-        folder: Directory in which the command is typed, if it is that of a session. It is then
-            without --out.
+        folder: Directory in which the command is typed; by default the present one.
         calibration: Calibration whose model, effects and known values the command repeats.
     """
     paths = sessions if folder is None else [os.path.relpath(s, folder) for s in sessions]
     names = [quote_path(path) for path in paths]
     options = [f"--tolerance {quote_path(f'{key}={value:g}')}" for key, value in tolerances.items()]
     options += [] if calibration is None else _repeat_choice(calibration)
-    out = [f"--out {names[-1]}-calibration"] if folder is None else []
-    return " ".join(["orthocal calibrate", *names, *options, *out])
+    out = quote_path(_name_calibration(sessions[-1], folder))
+    return " ".join(["orthocal calibrate", *names, *options, "--out", out])
+
+
+def _name_calibration(session: Path, folder: Path | None) -> str:
+    """Directory of a calibration beside its session, as seen from a directory.
+
+    Args:
+        session: Directory or YAML of the session.
+        folder: The directory; None for the present one.
+    """
+    named = session.parent if session.suffix == ".yaml" else session
+    if folder is None and named.name not in ("", ".."):
+        return f"{named}-calibration"
+    return os.path.relpath(f"{os.path.abspath(named)}-calibration", folder or Path())
 
 
 def _repeat_choice(calibration: Calibration) -> list[str]:

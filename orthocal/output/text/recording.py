@@ -8,6 +8,7 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
+from orthocal.output.text.answer import calibrate_command
 from orthocal.robot.model import drive_keys
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
@@ -450,14 +452,15 @@ class RecordingText:
                 f"drive, such as `controller: {{{keys}}}`. Without them only their "
                 "changes can be calculated."
             )
-        following = f"Next:\n  orthocal calibrate {command}"
+        following = f"Next:\n  {calibrate_command([Path(path)], {})}"
         if warnings:
             following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
         elif session.controller_offsets is not None and any(session.controller_offsets):
+            together = calibrate_command([Path("EARLIER"), Path(path)], {})
             following = (
                 "Next: validate the offsets that were entered, by their calibration,\n"
                 f"  orthocal validate CALIBRATION {command}\n"
-                f"or calibrate all sessions together:\n  orthocal calibrate EARLIER {command}"
+                f"or calibrate all sessions together:\n  {together}"
             )
             if session.offsets_from is not None:
                 entered = printable(shlex.quote(str(session.offsets_from)))

@@ -189,7 +189,7 @@ def test_front_page_states_zero_travel_and_approach(page):
     ) in text
     assert "After you have set the gauge zero, do not touch the bezel" in text
     assert "controller: {offsets_mm: [0, 0, 0]}" in text
-    assert words(page.findall(".//code")[-1]) == "orthocal calibrate ."
+    assert words(page.findall(".//code")[-1]) == "orthocal calibrate . --out DIRECTORY"
     assert "`" not in text
 
 
@@ -223,8 +223,8 @@ def test_sheet_after_a_calibration_has_shifted_travel_and_ends_with_validation(s
             "-150.0 to 70.0 mm; y_slide -65.0",
         )
         assert limits[not any(active)] in text
-        following = "validate CALIBRATION" if any(active) else "calibrate"
-        assert f"<code>orthocal {following} .</code>" in text
+        following = "validate CALIBRATION ." if any(active) else "calibrate . --out DIRECTORY"
+        assert f"<code>orthocal {following}</code>" in text
 
 
 def test_names_from_files_are_texts(files, page):
