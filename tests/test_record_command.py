@@ -162,6 +162,18 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
         assert words in text
 
 
+def test_each_setup_names_its_gauge_if_there_are_several(folder, run):
+    digital = "  digital: {sigma_mm: 0.001, tip: {ball: {radius_mm: 1.5}}}"
+    text = PLAN.replace("gauge: {", "gauges:\n  dial: {")
+    text = text.replace("postures:", f"{digital}\npostures:")
+    text = text.replace("{leg", "{gauge: dial, leg", 1).replace("{leg", "{gauge: digital, leg")
+    (folder / "session.yaml").write_text(text)
+    _, out, _ = run(folder, "0.01", "0.02", "0.03")
+    first, second = out.split("Setup zx")
+    assert "  Dial 'dial': -5 to 5 mm, resolution 0.01 mm\n" in first
+    assert "  Dial 'digital'\n" in second
+
+
 def test_joints_have_the_coordinates_of_the_controller(tmp_path):
     """The x joint counts down from 5 mm at the mechanical zero; active offsets are not shown."""
     machine = shutil.copytree(packaged_robots()["orthoglide"], tmp_path / "orthoglide")

@@ -483,11 +483,11 @@ def _gauge(session: Session, setup: Setup) -> str:
         facts.append(f"{gauge.range[0] / MM:g} to {gauge.range[1] / MM:g} mm")
     if gauge.resolution is not None:
         facts.append(f"resolution {gauge.resolution / MM:g} mm")
-    if not facts and not setup.gauge:
+    name = session.distinguish_gauge(setup.gauge)
+    if not facts and not name:
         return ""
-    noun = instrument(setup.sensor)
-    name = f" {setup.gauge}" if setup.gauge not in ("", noun) else ""
-    return ": ".join(t for t in (f"{noun.capitalize()}{name}", ", ".join(facts)) if t)
+    noun = instrument(setup.sensor).capitalize()
+    return ": ".join(t for t in (f"{noun} '{name}'" if name else noun, ", ".join(facts)) if t)
 
 
 def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
