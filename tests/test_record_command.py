@@ -712,9 +712,19 @@ def test_a_typed_side_is_corrected(folder, run):
     assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
     # later, and after another setup was read
     _, out, _ = run(folder, "n", "0.07", "back 2", "side pnp", "0.05", "back 3", "side p", "")
-    assert "Noted with this reading and the next ones: approach pnp." in " ".join(out.split())
+    assert "Noted with this reading only: approach ↑↓↑ (pnp)." in " ".join(out.split())
     assert [r["approach"] for r in rows_of(folder)] == ["pnp", "ppp", "nnn", "nnn", "", ""]
     assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
+
+
+def test_a_condition_of_a_corrected_reading_does_not_apply_to_the_next_ones(folder, run):
+    with_effects(folder, "backlash, thermal")
+    first = ["p", "20", "0.01", "0.02", "0.03"]
+    corrected = ["back 2", "side n", "", "back 3", "side u", "t 25", "0.02"]
+    run(folder, *first, "", "0.04", *corrected, "0.05", "side pnp", "t 21", "0.06")
+    rows = rows_of(folder)
+    assert [r["approach"] for r in rows] == ["nnn", "uuu", "ppp", "ppp", "ppp", "pnp"]
+    assert [r["temperature_C"] for r in rows] == ["20", "25", "20", "20", "20", "21"]
 
 
 def test_restart_deletes_typed_sides(folder, run):
@@ -754,7 +764,9 @@ def test_a_planned_side_of_approach_stays(folder, run):
     file.write_text("\n".join([f"{head},approach", *(f"{row},ppp" for row in rows), ""]))
     _, out, _ = run(folder, "side n", "0.02")
     assert "Noted with" not in out
-    assert "The plan states the side of this reading: ppp" in " ".join(out.split())
+    text = " ".join(out.split())
+    assert "The plan states the side of this reading: ↑ (ppp)" in text
+    assert "approach the posture again as the arrows show" in text
     assert [r["approach"] for r in rows_of(folder)] == ["ppp"] * 6
 
 

@@ -44,8 +44,9 @@ class _EndOfDialogue(Exception):
 
 
 class RecordedConditions:
-    """Conditions of the following readings.
+    """Conditions of the reading that is asked for and of the following readings.
 
+    A condition that is typed while an existing reading is corrected applies to that reading only.
     If an effect needs the temperature, it is asked for in each setup. The side of approach is asked
     for once if an effect needs it and the plan does not state it. The time is that of the clock,
     unless readings come from a file or from paper.
@@ -66,6 +67,8 @@ class RecordedConditions:
         self._needed = needed_conditions(recording.session.robot)
         self._asked: set[str] = set()
         """Setups whose temperature was asked for."""
+        self._following: tuple[str | None, float | None] | None = None
+        """Approach and temperature of the following readings while a reading is corrected."""
 
     def question(self, row: RecordedReading) -> str | None:
         """Condition to ask for before a row is read; None if all are known."""
@@ -86,7 +89,7 @@ class RecordedConditions:
             self.temperature = temperatures[-1]
 
     def set_condition(self, condition: str, text: str, row: RecordedReading | None) -> None:
-        """Set a condition of the following readings.
+        """Set a condition of an existing reading, or of a new one and the following ones.
 
         Args:
             condition: "approach" or "temperature".
@@ -96,6 +99,8 @@ class RecordedConditions:
         Raises:
             SessionError: If the text is invalid.
         """
+        if row is not None and row.is_read and self._following is None:
+            self._following = self.approach, self.temperature
         if condition == "approach":
             self._set_approach(text or self.programmed)
             return
@@ -103,6 +108,11 @@ class RecordedConditions:
             self._set_temperature(text)
         if row is not None:
             self._asked.add(row.setup)
+
+    def end_correction(self) -> None:
+        """Restore the conditions of the following readings after an existing one."""
+        if self._following is not None:
+            (self.approach, self.temperature), self._following = self._following, None
 
     def _set_temperature(self, text: str) -> None:
         """Set the temperature, [°C]; refuse one that no workshop has."""
@@ -190,6 +200,7 @@ class Dialogue:
 
     def _ask_for(self, index: int | None) -> None:
         """Ask for a row; None if all are read or skipped."""
+        self._conditions.end_correction()
         self._asked, self._stated = index, set()
         self._show()
 
@@ -321,7 +332,7 @@ class Dialogue:
         return not (word and (word[0].isalpha() or word == "?"))
 
     def _set_condition(self, condition: str, text: str) -> None:
-        """Set a condition of the reading that is asked for, and of the following ones."""
+        """Set a condition of the reading that is asked for; see `RecordedConditions`."""
         row = None if self._asked is None else self._recording.rows[self._asked]
         self._conditions.set_condition(condition, text, row)
         if self._asked is None or row is None:
@@ -330,7 +341,8 @@ class Dialogue:
             self._note(self._text.planned_side(row.planned_approach))
             return
         self._stated.add(condition)
-        self._note(self._text.conditions(self._conditions_of(self._asked)))
+        conditions = self._conditions_of(self._asked)
+        self._note(self._text.conditions(conditions, alone=row.is_read))
         if self._conditions.is_unusual and self._conditions.temperature is not None:
             self._note(self._text.unusual_temperature(self._conditions.temperature))
             self._conditions.is_unusual = False
