@@ -381,7 +381,7 @@ def test_a_warning_names_all_of_its_lines(root, run, tmp_path):
     text = run(tmp_path / "fine").stdout
     words = " ".join(text.split())
     assert "Finer than the gauge (lines 2 to 31): The gauge shows" in words
-    assert "but 30 of 54 readings have more digits" in words
+    assert "but 30 of its 54 readings have more digits" in words
 
 
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):
@@ -424,6 +424,24 @@ def test_warning_that_another_mistake_hides_is_not_resolved(root, run, tmp_path,
     assert [kind for kind, _ in WARNING.findall(out)] == ["Reversed sign"]
     assert f"! Line {wrong + 2} differs by" in out
     assert "Resolved" not in out
+
+
+def test_warning_is_not_resolved_while_readings_are_inconsistent(root, run, tmp_path, monkeypatch):
+    """That finding names no reading: it may be about those of the earlier warning."""
+    folder = tmp_path / "typed"
+    values = blank(root / "examples/raw-cycles", folder)
+    warning = review("reversed sign", "Reversed.", "", (Place(setup="zx"),))
+    inconsistent = review("inconsistent readings", "They do not fit.", "Measure again.")
+    monkeypatch.setattr(recording, "is_far", lambda *_: False)
+    findings = ((), (), (warning,), (inconsistent,), ())  # from the end of each setup on
+    monkeypatch.setattr(
+        recording, "find_warnings", lambda session: findings[len(session.readings) // 9]
+    )
+    _, out, _ = run(folder, *values[:36])
+    before, after = out.split("  Recorded: line 37,")
+    assert "! Inconsistent readings:" in before
+    assert "Resolved" not in before
+    assert "Resolved: inconsistent readings and reversed sign zx." in after
 
 
 def test_readings_with_a_warning_are_excluded_from_predictions(root, run, tmp_path):

@@ -471,12 +471,16 @@ class Dialogue:
     def _is_hidden(self, finding: Finding, warnings: Sequence[Finding]) -> bool:
         """True if a finding occurs again without all other doubtful readings.
 
+        A present finding that names no reading, such as inconsistent readings, may be about any.
+
         Args:
             finding: An earlier finding that is absent now.
             warnings: The present findings.
         """
         rows = self._recording.rows
         concerned = set(find_rows(finding, rows))
+        if concerned and not all(find_rows(f, rows) for f in warnings):
+            return True
         excluded = {i for f in warnings for i in find_rows(f, rows)}
         excluded |= {i for i, row in enumerate(rows) if row.key in self._far}
         excluded -= concerned
