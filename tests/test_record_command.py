@@ -252,12 +252,17 @@ ENTRIES = {
     "back to a dropped row twice": (
         ["drop 3", "back 3", "back 3"],
         [""] * 6,
-        "Not recorded: '3' is not a line; expected 2 to 8.",
+        "Not recorded: line 3 is line 8 now.",
     ),
     "repeat of a dropped row": (
         ["0.1", "drop 2", "repeat 2"],
         [""] * 5,
-        "Not recorded: '2' is not a line; expected 3 to 7.",
+        "Not recorded: line 2 was deleted; `back 2` adds it again, as the last line.",
+    ),
+    "back to a row that was dropped twice": (
+        ["drop 3", "back 3", "drop", "back 3", "0.1"],
+        ["0.10", "", "", "", ""],
+        "Not recorded: line 3 was deleted; `back 8` adds it again, as the last line.",
     ),
     "repeat of a line with the number of a dropped row": (
         ["drop 7", "0.1", "repeat 2", "repeat 7"],
@@ -452,6 +457,27 @@ def test_readings_with_a_warning_are_excluded_from_predictions(root, run, tmp_pa
     predicted = re.findall(r"predict (\S+) ± (\S+) mm", out)
     for value, (mean, half) in zip(values[14:17], predicted[-3:], strict=True):
         assert abs(float(value) - float(mean)) <= 1.5 * float(half)
+
+
+def test_a_missing_prediction_is_explained(root, run, tmp_path, monkeypatch):
+    """Readings with a warning are excluded: here all others of the setup."""
+    folder = tmp_path / "typed"
+    values = blank(root / "examples/raw-cycles", folder)
+    places = tuple(Place(setup="xy", line=line, file="readings.csv") for line in (2, 3))
+    warning = review("ambiguous", "One of these.", "", places)
+    monkeypatch.setattr(recording, "find_warnings", lambda session: (warning,))
+    monkeypatch.setattr(recording, "is_doubtful", lambda *_: True)
+    _, out, _ = run(folder, *values[:4])
+    reason = "No prediction: all other readings of this setup have a warning ({})."
+    assert re.findall(r"No prediction.*|predict (?=.*±)|Recorded: line \d", out) == [
+        "Recorded: line 2",
+        "Recorded: line 3",
+        reason.format("line 2"),
+        "Recorded: line 4",
+        reason.format("lines 2, 3"),
+        "Recorded: line 5",
+        "predict ",
+    ]
 
 
 def test_warnings_of_sound_sessions_are_findings_of_check(root, run, tmp_path):

@@ -180,6 +180,8 @@ class Dialogue:
         """Index of the row that was read last."""
         self._dropped: dict[str, list[RecordedReading]] = {}
         """Deleted rows by their line."""
+        self._restored: dict[str, str] = {}
+        """Lines of deleted rows, mapped to their lines since they were added again."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
         self._stated: set[str] = set()
@@ -403,7 +405,7 @@ class Dialogue:
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return False
-        if prediction := self._text.prediction(index, mean, std):
+        if prediction := self._text.prediction(index, mean, std, excluded=sorted(excluded)):
             self._say(prediction)
         self._far.discard(rows[index].key)
         if is_far(rows[index].value, mean, std):
@@ -534,13 +536,23 @@ class Dialogue:
             self._restore(line)
             return
         if line and line not in lines:
-            expected = f"{lines[0]} to {lines[-1]}"
-            raise SessionError(f"'{shorten(line)}' is not a line; expected {expected}")
+            raise SessionError(self._describe_missing(line, lines))
         commands = {
             **{"back": self._back, "repeat": self._repeat},
             **{"drop": self._drop, "restart": self._restart},
         }
         commands[name](lines.index(line) if line else None)
+
+    def _describe_missing(self, line: str, lines: Sequence[str]) -> str:
+        """Reason why there is no such line."""
+        now = line
+        while now in self._restored and now not in lines:
+            now = self._restored[now]
+        if now in self._dropped:
+            return f"line {line} was deleted; `back {now}` adds it again, as the last line"
+        if now != line:
+            return f"line {line} is line {now} now"
+        return f"'{shorten(line)}' is not a line; expected {lines[0]} to {lines[-1]}"
 
     def _switch_clock(self) -> None:
         self._conditions.clock = not self._conditions.clock
@@ -629,6 +641,7 @@ class Dialogue:
         index = self._recording.restore(self._dropped[line])
         del self._dropped[line]
         row = self._recording.rows[index]
+        self._restored[line] = str(row.line)
         self._note(f"Added: line {row.line}, {self._text.label(row)}.")
         self._ask_for(index)
 

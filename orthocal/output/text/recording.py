@@ -323,17 +323,26 @@ class RecordingText:
         text = f"Recorded: line {row.line}, {self.label(row)}: {self.value(index)} mm"
         return self.wrap(text, indent="  ")
 
-    def prediction(self, index: int, mean: float, std: float) -> str:
+    def prediction(
+        self, index: int, mean: float, std: float, *, excluded: Sequence[int] = ()
+    ) -> str:
         """Prediction of a reading by the others, with its expanded uncertainty (k = 2).
 
         Args:
             index: Index of the row.
             mean: Predicted reading, [m].
             std: Its standard deviation, [m]; infinite without a prediction.
+            excluded: Indices of the rows that are excluded because of warnings.
         """
+        rows = self._recording.rows
+        row = rows[index]
         if math.isinf(std):
-            return ""
-        row = self._recording.rows[index]
+            of_setup = [rows[i].line or 0 for i in excluded if rows[i].setup == row.setup]
+            if not of_setup:
+                return ""
+            where = spans(of_setup, "line")
+            text = f"No prediction: all other readings of this setup have a warning ({where})."
+            return self.wrap(text, indent="  ")
         of = ""
         if self.name(row) != row.setup:  # a coordinate of a point
             of = f" {row.setup.partition('[')[2].rstrip(']')}"
