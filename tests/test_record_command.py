@@ -163,6 +163,18 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
         assert words in text
 
 
+def test_each_setup_names_its_gauge_if_there_are_several(folder, run):
+    digital = "  digital: {sigma_mm: 0.001, tip: {ball: {radius_mm: 1.5}}}"
+    text = PLAN.replace("gauge: {", "gauges:\n  dial: {")
+    text = text.replace("postures:", f"{digital}\npostures:")
+    text = text.replace("{leg", "{gauge: dial, leg", 1).replace("{leg", "{gauge: digital, leg")
+    (folder / "session.yaml").write_text(text)
+    _, out, _ = run(folder, "0.01", "0.02", "0.03")
+    first, second = out.split("Setup zx")
+    assert "  Dial 'dial': -5 to 5 mm, resolution 0.01 mm\n" in first
+    assert "  Dial 'digital'\n" in second
+
+
 def test_joints_have_the_coordinates_of_the_controller(tmp_path):
     """The x joint counts down from 5 mm at the mechanical zero; active offsets are not shown."""
     machine = shutil.copytree(packaged_robots()["orthoglide"], tmp_path / "orthoglide")
@@ -241,12 +253,17 @@ ENTRIES = {
     "back to a dropped row twice": (
         ["drop 3", "back 3", "back 3"],
         [""] * 6,
-        "Not recorded: '3' is not a line; expected 2 to 8.",
+        "Not recorded: line 3 is line 8 now.",
     ),
     "repeat of a dropped row": (
         ["0.1", "drop 2", "repeat 2"],
         [""] * 5,
-        "Not recorded: '2' is not a line; expected 3 to 7.",
+        "Not recorded: line 2 was deleted; `back 2` adds it again, as the last line.",
+    ),
+    "back to a row that was dropped twice": (
+        ["drop 3", "back 3", "drop", "back 3", "0.1"],
+        ["0.10", "", "", "", ""],
+        "Not recorded: line 3 was deleted; `back 8` adds it again, as the last line.",
     ),
     "repeat of a line with the number of a dropped row": (
         ["drop 7", "0.1", "repeat 2", "repeat 7"],
@@ -370,7 +387,7 @@ def test_a_warning_names_all_of_its_lines(root, run, tmp_path):
     text = run(tmp_path / "fine").stdout
     words = " ".join(text.split())
     assert "Finer than the gauge (lines 2 to 31): The gauge shows" in words
-    assert "but 30 of 54 readings have more digits" in words
+    assert "but 30 of its 54 readings have more digits" in words
 
 
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):
@@ -415,6 +432,24 @@ def test_warning_that_another_mistake_hides_is_not_resolved(root, run, tmp_path,
     assert "Resolved" not in out
 
 
+def test_warning_is_not_resolved_while_readings_are_inconsistent(root, run, tmp_path, monkeypatch):
+    """That finding names no reading: it may be about those of the earlier warning."""
+    folder = tmp_path / "typed"
+    values = blank(root / "examples/raw-cycles", folder)
+    warning = review("reversed sign", "Reversed.", "", (Place(setup="zx"),))
+    inconsistent = review("inconsistent readings", "They do not fit.", "Measure again.")
+    monkeypatch.setattr(recording, "is_far", lambda *_: False)
+    findings = ((), (), (warning,), (inconsistent,), ())  # from the end of each setup on
+    monkeypatch.setattr(
+        recording, "find_warnings", lambda session: findings[len(session.readings) // 9]
+    )
+    _, out, _ = run(folder, *values[:36])
+    before, after = out.split("  Recorded: line 37,")
+    assert "! Inconsistent readings:" in before
+    assert "Resolved" not in before
+    assert "Resolved: inconsistent readings and reversed sign zx." in after
+
+
 def test_readings_with_a_warning_are_excluded_from_predictions(root, run, tmp_path):
     folder = tmp_path / "typed"
     values = blank(root / "examples/raw-cycles", folder)
@@ -423,6 +458,27 @@ def test_readings_with_a_warning_are_excluded_from_predictions(root, run, tmp_pa
     predicted = re.findall(r"predict (\S+) ± (\S+) mm", out)
     for value, (mean, half) in zip(values[14:17], predicted[-3:], strict=True):
         assert abs(float(value) - float(mean)) <= 1.5 * float(half)
+
+
+def test_a_missing_prediction_is_explained(root, run, tmp_path, monkeypatch):
+    """Readings with a warning are excluded: here all others of the setup."""
+    folder = tmp_path / "typed"
+    values = blank(root / "examples/raw-cycles", folder)
+    places = tuple(Place(setup="xy", line=line, file="readings.csv") for line in (2, 3))
+    warning = review("ambiguous", "One of these.", "", places)
+    monkeypatch.setattr(recording, "find_warnings", lambda session: (warning,))
+    monkeypatch.setattr(recording, "is_doubtful", lambda *_: True)
+    _, out, _ = run(folder, *values[:4])
+    reason = "No prediction: all other readings of this setup have a warning ({})."
+    assert re.findall(r"No prediction.*|predict (?=.*±)|Recorded: line \d", out) == [
+        "Recorded: line 2",
+        "Recorded: line 3",
+        reason.format("line 2"),
+        "Recorded: line 4",
+        reason.format("lines 2, 3"),
+        "Recorded: line 5",
+        "predict ",
+    ]
 
 
 def test_warnings_of_sound_sessions_are_findings_of_check(root, run, tmp_path):
@@ -701,9 +757,19 @@ def test_a_typed_side_is_corrected(folder, run):
     assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
     # later, and after another setup was read
     _, out, _ = run(folder, "n", "0.07", "back 2", "side pnp", "0.05", "back 3", "side p", "")
-    assert "Noted with this reading and the next ones: approach pnp." in " ".join(out.split())
+    assert "Noted with this reading only: approach ↑↓↑ (pnp)." in " ".join(out.split())
     assert [r["approach"] for r in rows_of(folder)] == ["pnp", "ppp", "nnn", "nnn", "", ""]
     assert cells(folder)[:3] == ["0.05", "0.03", "0.06"]
+
+
+def test_a_condition_of_a_corrected_reading_does_not_apply_to_the_next_ones(folder, run):
+    with_effects(folder, "backlash, thermal")
+    first = ["p", "20", "0.01", "0.02", "0.03"]
+    corrected = ["back 2", "side n", "", "back 3", "side u", "t 25", "0.02"]
+    run(folder, *first, "", "0.04", *corrected, "0.05", "side pnp", "t 21", "0.06")
+    rows = rows_of(folder)
+    assert [r["approach"] for r in rows] == ["nnn", "uuu", "ppp", "ppp", "ppp", "pnp"]
+    assert [r["temperature_C"] for r in rows] == ["20", "25", "20", "20", "20", "21"]
 
 
 def test_restart_deletes_typed_sides(folder, run):
@@ -743,7 +809,9 @@ def test_a_planned_side_of_approach_stays(folder, run):
     file.write_text("\n".join([f"{head},approach", *(f"{row},ppp" for row in rows), ""]))
     _, out, _ = run(folder, "side n", "0.02")
     assert "Noted with" not in out
-    assert "The plan states the side of this reading: ppp" in " ".join(out.split())
+    text = " ".join(out.split())
+    assert "The plan states the side of this reading: ↑ (ppp)" in text
+    assert "approach the posture again as the arrows show" in text
     assert [r["approach"] for r in rows_of(folder)] == ["ppp"] * 6
 
 

@@ -151,7 +151,7 @@ def plan_adjustments(
     if before is None:
         raise ParameterError(
             "the noise of the readings is unknown, and with it the expected tool error; read every "
-            "posture twice, or state gauge.sigma_mm"
+            "posture twice, or state sigma_mm of each gauge"
         )
     backlash = find_backlash(calibration)
     changes = backlash_changes(calibration, backlash)

@@ -102,22 +102,24 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
         step, sigma = gauge.resolution, gauge.sigma
         if not step:
             continue
+        of = _keys_of(session, name)
         if sigma and sigma > WRONG_UNIT_RATIO * step:
-            yield words.sigma_too_large(sigma, step=step)
+            yield words.sigma_too_large(sigma, of, step=step)
         if gauge.range and np.ptp(gauge.range) < MIN_RANGE_STEPS * step:
-            yield words.coarser_than_range(step, gauge.range)
+            yield words.coarser_than_range(step, gauge.range, of)
             continue
         rows = _rows_of(session, name)
         coarser = _coarser_step(session.values[rows], step)
         if noise_floor(sigma, coarser) > MIN_EXCESS * noise_floor(sigma, step):
-            yield words.finer_than_readings(len(rows), step, coarser)
+            yield words.finer_than_readings(len(rows), step, coarser, of)
         finer = _finer_rows(session, rows, gauge)
         if finer and (
             step > WRONG_UNIT_RATIO * sigma
             if sigma
             else np.ptp(session.values[rows]) < MIN_SPANNED_STEPS * step
         ):
-            yield words.coarser_than_readings(len(finer), len(rows), step, *_first(session, finer))
+            first = _first(session, finer)
+            yield words.coarser_than_readings(len(finer), len(rows), step, *first, of=of)
 
 
 def _coarser_step(values: Array, step: float) -> float:
@@ -148,7 +150,7 @@ def find_finer(session: Session) -> Iterator[Finding]:
                 step,
                 *first,
                 inches=inches,
-                name=name_if_several(session, name),
+                of=_keys_of(session, name),
             )
 
 
@@ -166,6 +168,15 @@ def _fit_inches(values: Array, step: float) -> bool:
     by_chance = (2.0 * half_width) ** len(values)
     fit = np.abs(steps - np.round(steps)) <= half_width
     return bool(fit.all()) and by_chance < MISTAKE_PROBABILITY
+
+
+def _keys_of(session: Session, name: str) -> words.GaugeKeys:
+    """Name of a gauge for a finding, and the place of its keys."""
+    return words.GaugeKeys(
+        session.distinguish_gauge(name),
+        resolution=session.locate_gauge_key(name, "resolution_mm"),
+        sigma=session.locate_gauge_key(name, "sigma_mm"),
+    )
 
 
 def _rows_of(session: Session, gauge_name: str) -> list[int]:
@@ -272,7 +283,8 @@ def _coarse(session: Session, fit: Fit) -> Finding | None:
     dof = noise.cycles_dof if repeated else noise.residual_dof
     if dof < MIN_DOF or not MIN_DIAL_SCATTER < WRONG_UNIT_RATIO * scatter < stated:
         return None  # readings without any scatter were computed
-    return words.sigma_too_large(stated, scatter=scatter)
+    (name,) = session.gauges_with_readings
+    return words.sigma_too_large(stated, _keys_of(session, name), scatter=scatter)
 
 
 def _check_distances(session: Session) -> Finding | None:
@@ -318,11 +330,6 @@ def _legs(robot: Robot) -> Finding | None:
     if max(lengths.values()) - min(lengths.values()) < SAME_LENGTH * tolerance:
         return None
     return words.legs_differ(describe_legs(robot), lengths)
-
-
-def name_if_several(session: Session, gauge: str) -> str:
-    """Name of a gauge, empty if the readings of the session have no other."""
-    return gauge if len(session.gauges_with_readings) > 1 else ""
 
 
 def _lengths(robot: Robot) -> dict[str, float]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.assessment.plausibility import name_if_several
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
@@ -140,7 +139,7 @@ def _describe_scatter(session: Session, gauge: str, repeats: Sequence[_Repeats])
         label_reading(session.robot, session.readings[worst[0]]),
         shown,
         [place_of(session, i) for i in worst[:MAX_PLACES]],
-        name_if_several(session, gauge),
+        session.distinguish_gauge(gauge),
     )
 
 

@@ -44,8 +44,9 @@ class _EndOfDialogue(Exception):
 
 
 class RecordedConditions:
-    """Conditions of the following readings.
+    """Conditions of the reading that is asked for and of the following readings.
 
+    A condition that is typed while an existing reading is corrected applies to that reading only.
     If an effect needs the temperature, it is asked for in each setup. The side of approach is asked
     for once if an effect needs it and the plan does not state it. The time is that of the clock,
     unless readings come from a file or from paper.
@@ -66,6 +67,8 @@ class RecordedConditions:
         self._needed = needed_conditions(recording.session.robot)
         self._asked: set[str] = set()
         """Setups whose temperature was asked for."""
+        self._following: tuple[str | None, float | None] | None = None
+        """Approach and temperature of the following readings while a reading is corrected."""
 
     def question(self, row: RecordedReading) -> str | None:
         """Condition to ask for before a row is read; None if all are known."""
@@ -86,7 +89,7 @@ class RecordedConditions:
             self.temperature = temperatures[-1]
 
     def set_condition(self, condition: str, text: str, row: RecordedReading | None) -> None:
-        """Set a condition of the following readings.
+        """Set a condition of an existing reading, or of a new one and the following ones.
 
         Args:
             condition: "approach" or "temperature".
@@ -96,6 +99,8 @@ class RecordedConditions:
         Raises:
             SessionError: If the text is invalid.
         """
+        if row is not None and row.is_read and self._following is None:
+            self._following = self.approach, self.temperature
         if condition == "approach":
             self._set_approach(text or self.programmed)
             return
@@ -103,6 +108,11 @@ class RecordedConditions:
             self._set_temperature(text)
         if row is not None:
             self._asked.add(row.setup)
+
+    def end_correction(self) -> None:
+        """Restore the conditions of the following readings after an existing one."""
+        if self._following is not None:
+            (self.approach, self.temperature), self._following = self._following, None
 
     def _set_temperature(self, text: str) -> None:
         """Set the temperature, [°C]; refuse one that no workshop has."""
@@ -170,6 +180,8 @@ class Dialogue:
         """Index of the row that was read last."""
         self._dropped: dict[str, list[RecordedReading]] = {}
         """Deleted rows by their line."""
+        self._restored: dict[str, str] = {}
+        """Lines of deleted rows, mapped to their lines since they were added again."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
         self._stated: set[str] = set()
@@ -190,6 +202,7 @@ class Dialogue:
 
     def _ask_for(self, index: int | None) -> None:
         """Ask for a row; None if all are read or skipped."""
+        self._conditions.end_correction()
         self._asked, self._stated = index, set()
         self._show()
 
@@ -321,7 +334,7 @@ class Dialogue:
         return not (word and (word[0].isalpha() or word == "?"))
 
     def _set_condition(self, condition: str, text: str) -> None:
-        """Set a condition of the reading that is asked for, and of the following ones."""
+        """Set a condition of the reading that is asked for; see `RecordedConditions`."""
         row = None if self._asked is None else self._recording.rows[self._asked]
         self._conditions.set_condition(condition, text, row)
         if self._asked is None or row is None:
@@ -330,7 +343,8 @@ class Dialogue:
             self._note(self._text.planned_side(row.planned_approach))
             return
         self._stated.add(condition)
-        self._note(self._text.conditions(self._conditions_of(self._asked)))
+        conditions = self._conditions_of(self._asked)
+        self._note(self._text.conditions(conditions, alone=row.is_read))
         if self._conditions.is_unusual and self._conditions.temperature is not None:
             self._note(self._text.unusual_temperature(self._conditions.temperature))
             self._conditions.is_unusual = False
@@ -391,7 +405,7 @@ class Dialogue:
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return False
-        if prediction := self._text.prediction(index, mean, std):
+        if prediction := self._text.prediction(index, mean, std, excluded=sorted(excluded)):
             self._say(prediction)
         self._far.discard(rows[index].key)
         if is_far(rows[index].value, mean, std):
@@ -459,12 +473,16 @@ class Dialogue:
     def _is_hidden(self, finding: Finding, warnings: Sequence[Finding]) -> bool:
         """True if a finding occurs again without all other doubtful readings.
 
+        A present finding that names no reading, such as inconsistent readings, may be about any.
+
         Args:
             finding: An earlier finding that is absent now.
             warnings: The present findings.
         """
         rows = self._recording.rows
         concerned = set(find_rows(finding, rows))
+        if concerned and not all(find_rows(f, rows) for f in warnings):
+            return True
         excluded = {i for f in warnings for i in find_rows(f, rows)}
         excluded |= {i for i, row in enumerate(rows) if row.key in self._far}
         excluded -= concerned
@@ -518,13 +536,23 @@ class Dialogue:
             self._restore(line)
             return
         if line and line not in lines:
-            expected = f"{lines[0]} to {lines[-1]}"
-            raise SessionError(f"'{shorten(line)}' is not a line; expected {expected}")
+            raise SessionError(self._describe_missing(line, lines))
         commands = {
             **{"back": self._back, "repeat": self._repeat},
             **{"drop": self._drop, "restart": self._restart},
         }
         commands[name](lines.index(line) if line else None)
+
+    def _describe_missing(self, line: str, lines: Sequence[str]) -> str:
+        """Reason why there is no such line."""
+        now = line
+        while now in self._restored and now not in lines:
+            now = self._restored[now]
+        if now in self._dropped:
+            return f"line {line} was deleted; `back {now}` adds it again, as the last line"
+        if now != line:
+            return f"line {line} is line {now} now"
+        return f"'{shorten(line)}' is not a line; expected {lines[0]} to {lines[-1]}"
 
     def _switch_clock(self) -> None:
         self._conditions.clock = not self._conditions.clock
@@ -613,6 +641,7 @@ class Dialogue:
         index = self._recording.restore(self._dropped[line])
         del self._dropped[line]
         row = self._recording.rows[index]
+        self._restored[line] = str(row.line)
         self._note(f"Added: line {row.line}, {self._text.label(row)}.")
         self._ask_for(index)
 

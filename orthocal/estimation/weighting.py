@@ -99,19 +99,34 @@ def with_initial_noise(problem: CalibrationProblem) -> CalibrationProblem:
     return problem.with_noise_ratio(sigmas / sigmas[groups[0].entries][0])
 
 
-def initial_sigmas(session: Session, observations: Observations) -> Array:
+def initial_sigmas(
+    session: Session, observations: Observations, *, without: int | None = None
+) -> Array:
     """Standard deviation of each entry before the first solution, shape (n_entries,), [m].
 
     The scatter of repeated cycles of a gauge with a stated noise is that of most of its setups, so
     that it does not contain a mistake in one of them.
+
+    Args:
+        session: The session.
+        observations: Its entries.
+        without: Index of a row to be predicted; its reading has no influence. The result is then
+            at least the assumed noise, because few others may be equal by chance.
     """
     values = observations.values(session.values)
+    used = np.ones(observations.size, dtype=np.bool_)
+    if without is not None:
+        used[observations.plus[without]] = False
+        if observations.minus[without] >= 0:
+            used[observations.minus[without]] = False
     result = np.empty(observations.size)
     for g in split_by_gauge(session, observations):
-        repeatability = _repeatability(values, observations, g)
+        group = replace(g, entries=g.entries & used)
+        repeatability = _repeatability(values, observations, group)
         if g.gauge.sigma is not None and repeatability[1]:
-            repeatability = _median_repeatability(values, observations, g), repeatability[1]
-        result[g.entries] = initial_sigma(g.gauge, repeatability)
+            repeatability = _median_repeatability(values, observations, group), repeatability[1]
+        sigma = initial_sigma(g.gauge, repeatability)
+        result[g.entries] = sigma if without is None else max(sigma, assumed_sigma(g.gauge))
     return result
 
 
@@ -261,7 +276,7 @@ def _median_repeatability(values: Array, o: Observations, group: GaugeReadings) 
     """
     squares = []
     for setup in np.unique(o.setup[group.entries]):
-        entries = o.setup == setup
+        entries = group.entries & (o.setup == setup)
         scatter, dof = estimate_repeatability(values[entries], o.only(entries))
         if dof:
             squares.append(scatter**2 / (1.0 - 2.0 / (9.0 * dof)) ** 3)

@@ -72,21 +72,32 @@ class LinearModel:
     Args:
         session: A session, or several joined ones.
         names: Names of the errors that the machine may have; all by default.
+        sigmas: Standard deviations of the entries of several gauges, shape (n_entries,), [m]; by
+            default those of `initial_sigmas`.
 
     Raises:
         RobotError: If closures of the robot depend on each other.
     """
 
-    def __init__(self, session: Session, names: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        names: Sequence[str] | None = None,
+        *,
+        sigmas: Array | None = None,
+    ) -> None:
+        self._names = names
         session = _refer_to_most_corrected(session)
         free = machine_errors(session.robot) if names is None else names
         selection = select_parameters(session.robot.parameters, free=free, prior=True)
         problem = CalibrationProblem(session, selection)
         o = problem.observations
         gauges = split_by_gauge(session, o)
-        sigmas = np.full(o.size, assumed_sigma(session.gauge))
-        if len(gauges) > 1:
+        if len(gauges) == 1:
+            sigmas = np.full(o.size, assumed_sigma(session.gauge))
+        elif sigmas is None:
             sigmas = initial_sigmas(session, o)
+        self._sigmas = sigmas
         self.stated = all(g.gauge.sigma is not None for g in gauges)
         self.sigma = float(sigmas[gauges[0].entries][0])
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
@@ -416,6 +427,9 @@ class LinearModel:
         Raises:
             ClosureError: If the nominal machine cannot reach a posture.
         """
+        model = self._without_noise_of(row)
+        if model is not self:
+            return model.predict_row(rows, row)
         entries, effect = self.entries(np.array([rows, np.arange(rows.size) == row]))
         about = self.approach(entries, effect)
         (amount,), (std,) = about.likelihood.estimate_amounts(
@@ -438,6 +452,9 @@ class LinearModel:
         Raises:
             ClosureError: If the nominal machine cannot reach a posture.
         """
+        model = self._without_noise_of(row)
+        if model is not self:
+            return model.compare_row(rows, row)
         mean, std = self.predict_row(rows, row)
         deviation = abs(rows[row] - mean)
         if not deviation > std:
@@ -450,6 +467,16 @@ class LinearModel:
             misfits.append(about.likelihood.misfit(entries - about.expected))
         increase = max(misfits[0] - misfits[1], 0.0)
         return mean, max(std, deviation / max(math.sqrt(increase), 1.0))
+
+    def _without_noise_of(self, row: int) -> LinearModel:
+        """Model whose noise is estimated without a row; the same model if it does not change."""
+        session = self.problem.session
+        if len(session.gauges_with_readings) == 1:
+            return self
+        sigmas = initial_sigmas(session, self.problem.observations, without=row)
+        if np.array_equal(sigmas, self._sigmas):
+            return self
+        return LinearModel(session, self._names, sigmas=sigmas)
 
     def predict_left_out(self, rows: Array) -> Array:
         """Readings of each setup minus their predictions from all other setups, (n_rows,), [m].

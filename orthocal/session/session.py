@@ -311,10 +311,23 @@ class Session:
         """The first gauge with readings. The noise of other gauges is stated relative to it."""
         return next(iter((self.gauges_with_readings or self.gauges).values()))
 
+    def distinguish_gauge(self, gauge: str) -> str:
+        """Name of a gauge; empty if the readings of the session have no other."""
+        return gauge if len(self.gauges_with_readings) > 1 else ""
+
+    def path_of(self, label: str) -> Path | None:
+        """Path to the session.yaml of a joined session by its label; None if unknown."""
+        names = list(dict.fromkeys(self.labels))
+        if len(self.parts) != len(names) or label not in names:
+            return None
+        return self.parts[names.index(label)].path
+
     def locate_gauge_key(self, gauge: str, key: str) -> str:
         """File and key of a gauge, for messages."""
-        path = f"gauges.{gauge}.{key}" if gauge else f"gauge.{key}"
-        return path if self.path is None else f"{self.path}: {path}"
+        label, name = split_label(gauge, joined=self.joined)
+        file = self.path_of(label) if self.joined else self.path
+        path = f"gauges.{name}.{key}" if name else f"gauge.{key}"
+        return path if file is None else f"{file}: {path}"
 
     def with_gauge(self, gauge: Gauge) -> Session:
         """Session with one gauge for all setups."""

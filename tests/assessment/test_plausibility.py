@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import plans
 import pytest
 from calibrated import calibrated, plan_of, session_of
+from gauges import with_gauges
 from machines import write_orthoglide
 from models import TRUTH
 
@@ -47,7 +49,7 @@ def kinds(session):
 def test_readings_in_inches_are_found(session):
     inches = session.with_values(np.round(session.values / 25.4, 7))
     (finer,) = (f for f in find_implausible(inches) if f.kind == "finer than the gauge")
-    assert finer.text.startswith("All 54 readings appear to be in inches")
+    assert finer.text.startswith("All 54 readings of the gauge appear to be in inches")
     coarse = session.with_values(np.round(session.values / 25.4, 6))  # no multiples in inches
     (finer,) = (f for f in find_implausible(coarse) if f.kind == "finer than the gauge")
     assert "readings have more digits, or are in inches" in finer.text
@@ -160,6 +162,21 @@ def test_a_resolution_of_a_tenth_of_the_readings_is_the_only_finding(cycles):
     assert found.numbers == pytest.approx({"resolution_mm": 0.001, "coarser_mm": 0.01})
     rows = np.arange(5)  # five such readings may be by chance
     assert not list(find_impossible_gauges(wrong.select([wrong.readings[i] for i in rows])))
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_a_finding_about_one_of_several_gauges_states_its_key_and_its_readings(cycles, joined):
+    coarse, fine = cycles.gauge, replace(cycles.gauge, resolution=1e-6, sigma=0.5e-6)
+    session = with_gauges(cycles, {"coarse": coarse, "fine": fine}, ["yx", "zx"])
+    session = replace(session, path=Path("tuesday/session.yaml"))
+    if joined:
+        session = join_sessions([replace(cycles, sha256=""), session])
+    (found,) = find_impossible_gauges(session)
+    name = "tuesday/fine" if joined else "fine"
+    count = sum(session.setups[r.setup].gauge == name for r in session.readings)
+    assert f"'{name}'" in found.words
+    assert "tuesday/session.yaml: gauges.fine.resolution_mm" in found.words
+    assert f"its {count} readings" in found.words
 
 
 @pytest.mark.parametrize("resolution", [1e-6, 5e-6, 10e-6, None])

@@ -46,8 +46,9 @@ def part(session, count):
     return session.select(session.readings[:count])
 
 
-def with_two_gauges(session):
-    gauges = {"coarse": session.gauge, "fine": replace(session.gauge, sigma=1e-6, resolution=None)}
+def with_two_gauges(session, *, stated=True):
+    fine = replace(session.gauge, sigma=1e-6 if stated else None, resolution=None)
+    gauges = {"coarse": session.gauge, "fine": fine}
     setups = {
         n: replace(s, gauge="fine" if i % 2 else "coarse")
         for i, (n, s) in enumerate(session.setups.items())
@@ -127,6 +128,27 @@ def test_repeated_readings_predict_their_mean():
         mean, std = predict(session.values, 2)
         assert mean == pytest.approx(0.11 * MM, abs=1e-12)
         assert std == pytest.approx(np.hypot(0.01, 0.01 / np.sqrt(12.0)) * MM * np.sqrt(1.5))
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_repeated_reading_of_several_gauges_does_not_change_its_own_prediction(stated):
+    """The noise of several gauges is estimated from repeated readings, but not from this one."""
+    session = with_two_gauges(session_of("raw-cycles"), stated=stated)
+    (row, *_) = [
+        i
+        for i, r in enumerate(session.readings)
+        if session.setups[r.setup].gauge == "fine" and r.cycle == 3
+    ]
+    mean, std = LinearModel(session).compare_row(session.values, row)
+    assert abs(session.values[row] - mean) < 3.0 * std
+    for error in (0.4 * MM, 0.95 * MM):
+        wrong = session.values.copy()
+        wrong[row] += error
+        model = LinearModel(session.with_values(wrong))
+        assert model.predict_row(wrong, row) == pytest.approx((mean, std), rel=1e-9)
+        compared, larger = model.compare_row(wrong, row)
+        assert compared == pytest.approx(mean, rel=1e-9)
+        assert error > 3.0 * larger
 
 
 def test_a_reading_that_shows_another_offset_does_not_contradict_the_others():

@@ -318,10 +318,7 @@ def place_of(session: Session, row: int) -> Place:
 
 def _file_of(session: Session, label: str) -> str | None:
     """Path to the session.yaml of a joined session; None if unknown."""
-    names = list(dict.fromkeys(session.labels))
-    if len(session.parts) != len(names) or label not in names:
-        return None
-    path = session.parts[names.index(label)].path
+    path = session.path_of(label)
     return None if path is None else str(path)
 
 

@@ -20,7 +20,7 @@ def noise_unknown() -> Finding:
         "noise unknown",
         "There are as many parameters as readings, so these do not show the noise, and the session "
         "does not state the noise of the gauge. The uncertainty is unknown.",
-        "State gauge.sigma_mm, or repeat the readings in cycles.",
+        "State the noise of each gauge (sigma_mm), or repeat the readings in cycles.",
     )
 
 
@@ -31,7 +31,9 @@ def noise_not_converged(sigma: float, *, gauges: int) -> Finding:
         "no convergence",
         "The estimated noise of a reading differs between the last two solutions, so the values "
         "and their ± are approximate.",
-        "State gauge.sigma_mm, or repeat all readings in cycles." if gauges == 1 else several,
+        "State sigma_mm of the gauge, or repeat all readings in cycles."
+        if gauges == 1
+        else several,
         sigma_mm=sigma / MM,
     )
 
@@ -47,7 +49,7 @@ def noise_from_residuals(sigma: float) -> Finding:
         "noise from residuals",
         "The noise is estimated from the residuals alone, so unmodelled errors count as noise. "
         "Whether the machine is within its tolerances is not checked, and ± may be too small.",
-        "Repeat readings in cycles, or state gauge.sigma_mm.",
+        "Repeat readings in cycles, or state the noise of each gauge (sigma_mm).",
         sigma_mm=sigma / MM,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from orthocal.assessment.wording import (
     joined,
@@ -110,6 +111,18 @@ def above_tolerances(scale: float) -> Finding:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class GaugeKeys:
+    """Gauge of a finding."""
+
+    name: str
+    """Name of the gauge; empty if the readings have no other."""
+    resolution: str
+    """File and key of its resolution."""
+    sigma: str
+    """File and key of its noise."""
+
+
 def _named(gauge: str) -> str:
     """Name of one of several gauges after its noun."""
     return f" '{gauge}'" if gauge else ""
@@ -124,7 +137,7 @@ def finer_than_gauge(
     places: Sequence[Place],
     *,
     inches: bool,
-    name: str,
+    of: GaugeKeys,
 ) -> Finding:
     """Finding about readings between the steps of the gauge.
 
@@ -136,19 +149,20 @@ def finer_than_gauge(
         value: Its value, [m].
         places: Places of all of them.
         inches: Whether all readings of the gauge are multiples of the step if they are in inches.
-        name: Name of the gauge; empty if there is only one.
+        of: The gauge.
     """
     first = f"The first is {value / MM:.6g} mm in {where}."
     text, action = (
-        f"The gauge{_named(name)} shows steps of {step / MM:g} mm (resolution), but {count} of "
-        f"{total} readings have more digits, or are in inches. {first}",
+        f"The gauge{_named(of.name)} shows steps of {step / MM:g} mm ({of.resolution}), but "
+        f"{count} of its {total} readings have more digits, or are in inches. {first}",
         "Make sure that the readings are in mm, not in inches, and that the resolution is right"
-        f"{', and that each setup names its gauge' if name else ''}.",
+        f"{', and that each setup names its gauge' if of.name else ''}.",
     )
     if inches:
         text, action = (
-            f"All {total} readings appear to be in inches: multiplied by 25.4, they are multiples "
-            f"of the resolution, {step / MM:g} mm. {first}",
+            f"All {total} readings of the gauge{_named(of.name)} appear to be in inches: "
+            "multiplied by 25.4, they are multiples of the resolution, "
+            f"{step / MM:g} mm. {first}",
             "If so, multiply these readings by 25.4, or use `orthocal import --unit inch`.",
         )
     return review(
@@ -161,41 +175,54 @@ def finer_than_gauge(
     )
 
 
-def coarser_than_range(step: float, limits: tuple[float, float]) -> Finding:
+def _stated_resolution(step: float, of: GaugeKeys) -> str:
+    """Beginning of a sentence about the stated resolution of a gauge, [m]."""
+    return (
+        f"The stated resolution of the gauge{_named(of.name)} is {step / MM:g} mm "
+        f"({of.resolution}), but"
+    )
+
+
+def coarser_than_range(step: float, limits: tuple[float, float], of: GaugeKeys) -> Finding:
     """Finding that the stated range of the gauge has only a few of its steps."""
     low, high = (limit / MM for limit in limits)
     return review(
         "resolution too coarse",
-        f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm) for a gauge "
-        f"that shows {low:g} … {high:g} mm.",
-        "Make sure that gauge.resolution_mm and gauge.range_mm are in mm.",
+        f"{_stated_resolution(step, of)} its range is {low:g} … {high:g} mm.",
+        "Make sure that its resolution_mm and its range_mm are in mm.",
         resolution_mm=step / MM,
         range_mm=high - low,
     )
 
 
 def coarser_than_readings(
-    count: int, total: int, step: float, where: str, value: float, places: Sequence[Place]
+    count: int,
+    total: int,
+    step: float,
+    where: str,
+    value: float,
+    places: Sequence[Place],
+    *,
+    of: GaugeKeys,
 ) -> Finding:
     """Finding that readings contradict the stated resolution of the gauge."""
     return review(
         "resolution too coarse",
-        f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm), but {count} "
-        f"of {total} readings lie between such steps. The first is {value / MM:.6g} mm in {where}.",
-        "Make sure that gauge.resolution_mm is right, and that the readings are in mm.",
+        f"{_stated_resolution(step, of)} {count} of its {total} readings lie between such steps. "
+        f"The first is {value / MM:.6g} mm in {where}.",
+        "Make sure that its resolution_mm is right, and that the readings are in mm.",
         places,
         readings_between_steps=float(count),
         resolution_mm=step / MM,
     )
 
 
-def finer_than_readings(total: int, step: float, coarser: float) -> Finding:
+def finer_than_readings(total: int, step: float, coarser: float, of: GaugeKeys) -> Finding:
     """Finding that all readings are multiples of a coarser step than the stated one, [m]."""
     return review(
         "resolution too fine",
-        f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm), but all "
-        f"{total} readings are multiples of {coarser / MM:g} mm. Such readings scatter more than "
-        "the stated noise.",
+        f"{_stated_resolution(step, of)} all its {total} readings are multiples of "
+        f"{coarser / MM:g} mm. Such readings scatter more than the stated noise.",
         f"State `resolution_mm: {coarser / MM:g}`, and the noise of this gauge in sigma_mm; or "
         "write all digits that the gauge shows.",
         resolution_mm=step / MM,
@@ -217,25 +244,28 @@ def residuals_too_small(residual: float, rounding: float, step: float) -> Findin
     )
 
 
-def sigma_too_large(stated: float, *, scatter: float | None = None, step: float = 0.0) -> Finding:
+def sigma_too_large(
+    stated: float, of: GaugeKeys, *, scatter: float | None = None, step: float = 0.0
+) -> Finding:
     """Finding about a stated noise far above the scatter or the resolution of the gauge.
 
     Args:
         stated: Stated noise, [m].
+        of: The gauge.
         scatter: Scatter of the readings, [m]; None to compare with the resolution.
         step: Resolution of the gauge, [m].
     """
     shown = (
-        f"The gauge's resolution is {step / MM:g} mm."
+        f"Its resolution is {step / MM:g} mm."
         if scatter is None
-        else f"The readings scatter by {scatter / MM:.2g} mm."
+        else f"Its readings scatter by {scatter / MM:.2g} mm."
     )
     reference = step if scatter is None else scatter
     return review(
         "sigma too large",
-        f"The session states that a reading scatters by {stated / MM:g} mm (gauge.sigma_mm). "
+        f"The stated noise of the gauge{_named(of.name)} is {stated / MM:g} mm ({of.sigma}). "
         f"{shown}",
-        "Make sure that gauge.sigma_mm is in mm.",
+        "Make sure that its sigma_mm is in mm.",
         gauge_sigma_mm=stated / MM,
         **{"resolution_mm" if scatter is None else "scatter_mm": reference / MM},
         ratio=stated / reference,

@@ -172,7 +172,7 @@ def write_program(
         f"F{options.feed:g}",
         *_before_motion(robot, sensor, stops[0], options),
     ]
-    mount = _mount(sensor)
+    mount = _mount(sensor, session.distinguish_gauge(of_setup.gauge))
     for i, stop in enumerate(stops):
         zero = "0" if stop.role == "subtracted" else ""
         if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
@@ -222,14 +222,21 @@ def _before_motion(
     )
 
 
-def _mount(sensor: Sensor) -> str:
-    """Instruction at the first pause after a motion."""
+def _mount(sensor: Sensor, name: str) -> str:
+    """Instruction at the first pause after a motion.
+
+    Args:
+        sensor: The sensor of the setup.
+        name: Name of its gauge; empty if the readings have no other.
+    """
+    gauge = f"gauge {comment_safe(name, LONGEST_NAME)}" if name else "the gauge"
     if isinstance(sensor, BallBar):
-        return "place the fixed ball unless it is in place, then mount the bar as the sheet shows"
+        bar = f"the bar with {gauge}" if name else "the bar"
+        return f"place the fixed ball unless it is in place, then mount {bar} as the sheet shows"
     if mounting_steps(sensor) is not None:
-        return "mount the gauge as the sheet shows"
+        return f"mount {gauge} as the sheet shows"
     align = "align its ball as the sheet shows" if isinstance(sensor, BallIndicator) else "align it"
-    return f"mount the gauge, {align}"
+    return f"mount {gauge}, {align}"
 
 
 def _end(sensor: Sensor) -> str:

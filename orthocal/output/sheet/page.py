@@ -38,7 +38,7 @@ from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
 from orthocal.sensors.protocol import has_dial, mounting_steps, tool_path
 from orthocal.session.points import one_row_per_point
-from orthocal.session.session import Session, Setup
+from orthocal.session.session import Gauge, Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
 
@@ -139,13 +139,18 @@ def _front(
         f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}. "
         f"Gauge: {_gauges(session)}."
     )
-    headers = ("", "setup", "measures", "readings", *(("program",) if with_programs else ()))
+    several = len(session.gauges_with_readings) > 1
+    headers = (
+        *("", "setup", "measures", *(["gauge"] if several else []), "readings"),
+        *(["program"] if with_programs else []),
+    )
     rows = []
     for m in motions:
         count = str(sum(s.role == "reading" for s in m.stops))
-        measured = session.setups[m.setup].sensor.describe()
+        setup = session.setups[m.setup]
+        gauge = (setup.gauge,) if several else ()
         program = (program_name(m),) if with_programs else ()
-        rows.append((str(m.number), m.setup, measured, count, *program))
+        rows.append((str(m.number), m.setup, setup.sensor.describe(), *gauge, count, *program))
     normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
@@ -173,7 +178,7 @@ def _front(
         + heading("Rules for all readings", level=3)
         + _numbered(_reading_rules(session, motions))
         + heading("Setups, in this order", level=3)
-        + table(headers, rows, left=3)
+        + table(headers, rows, left=3 + several)
         + (_programs(options, with_bar=_has_bar(session)) if with_programs else "")
     )
 
@@ -229,8 +234,10 @@ def _setup(
 ) -> str:
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
     program = f" Program: {program_name(motion)}." if with_program else ""
-    sensor = session.setups[motion.setup].sensor
+    sensor, name = session.setups[motion.setup].sensor, session.setups[motion.setup].gauge
     measured = sensor.describe()
+    if session.distinguish_gauge(name):
+        measured += f". Gauge: {_gauge(name, session.gauges[name])}"
     at_zero = "" if gauge.leg is None else "At the mechanical zero: "
     end = _compare_closing(session, motion)
     end += REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
@@ -457,16 +464,18 @@ def _numbered(texts: list[str]) -> str:
 
 def _gauges(session: Session) -> str:
     """Name, range and resolution of the gauges."""
-    texts = []
-    for name, gauge in session.gauges.items():
-        parts = [name] if name else []
-        if gauge.range is not None:
-            low, high = (_short(v) for v in gauge.range)
-            parts.append(f"{low} … {high} mm")
-        if gauge.resolution is not None:
-            parts.append(f"read to {gauge.resolution / MM:g} mm")
-        texts.append(", ".join(parts) or "any dial")
-    return "; ".join(texts)
+    return "; ".join(_gauge(name, gauge) for name, gauge in session.gauges.items())
+
+
+def _gauge(name: str, gauge: Gauge) -> str:
+    """Name, range and resolution of a gauge."""
+    parts = [name] if name else []
+    if gauge.range is not None:
+        low, high = (_short(v) for v in gauge.range)
+        parts.append(f"{low} … {high} mm")
+    if gauge.resolution is not None:
+        parts.append(f"read to {gauge.resolution / MM:g} mm")
+    return ", ".join(parts) or "any dial"
 
 
 def _active_offsets(session: Session) -> str:

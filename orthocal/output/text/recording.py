@@ -51,8 +51,10 @@ COMMANDS = {
     "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
     "`restart 7` the setup of line 7",
-    "temperature": "temperature in °C of this reading and the next ones, such as `t 22.5`",
-    "side": "approach of this reading and the next ones, unless the plan states it: `side n`",
+    "temperature": "temperature in °C of this reading and the next ones, such as `t 22.5`; after "
+    "`back`, of the corrected reading only",
+    "side": "approach of this reading and the next ones, unless the plan states it: `side n`; "
+    "after `back`, of the corrected reading only",
     "clock": "begin or stop to note the time of each reading; stop if you type from paper",
     "list": "all lines and their readings",
     "show": "this setup and posture once more",
@@ -97,14 +99,24 @@ class RecordingText:
             f"Enter: {programmed} ({arrow}), as the programs do. `side n` changes it later."
         )
 
-    def conditions(self, conditions: Conditions) -> str:
-        """Conditions that are noted with the reading that is asked for, and with the next ones."""
+    def conditions(self, conditions: Conditions, *, alone: bool) -> str:
+        """Conditions that are noted with the reading that is asked for.
+
+        Args:
+            conditions: The conditions.
+            alone: Whether they are not noted with the next readings, too.
+        """
         noted = []
         if conditions.approach is not None:
-            noted.append(f"approach {conditions.approach}")
+            noted.append(f"approach {self._side(conditions.approach)}")
         if conditions.temperature is not None:
             noted.append(f"{conditions.temperature:g} °C")
-        return f"Noted with this reading and the next ones: {', '.join(noted) or 'no temperature'}."
+        readings = "this reading only" if alone else "this reading and the next ones"
+        return f"Noted with {readings}: {', '.join(noted) or 'no temperature'}."
+
+    def _side(self, approach: str) -> str:
+        """Arrows of an approach, and its letters in brackets."""
+        return f"{describe_approach(self._session.robot, approach)} ({approach})"
 
     def unusual_temperature(self, temperature: float) -> str:
         """Question whether a temperature, [°C], is right."""
@@ -113,7 +125,9 @@ class RecordingText:
     def planned_side(self, approach: str) -> str:
         """Refusal of a side for a reading whose approach the plan states."""
         return (
-            f"The plan states the side of this reading: {approach}. `side` changes no such reading."
+            f"The plan states the side of this reading: {self._side(approach)}. `side` cannot "
+            "change it. If the machine came from another side, approach the posture again as the "
+            "arrows show. Then read the gauge and type the reading."
         )
 
     def clock(self, *, on: bool) -> str:
@@ -311,17 +325,26 @@ class RecordingText:
         text = f"Recorded: line {row.line}, {self.label(row)}: {self.value(index)} mm"
         return self.wrap(text, indent="  ")
 
-    def prediction(self, index: int, mean: float, std: float) -> str:
+    def prediction(
+        self, index: int, mean: float, std: float, *, excluded: Sequence[int] = ()
+    ) -> str:
         """Prediction of a reading by the others, with its expanded uncertainty (k = 2).
 
         Args:
             index: Index of the row.
             mean: Predicted reading, [m].
             std: Its standard deviation, [m]; infinite without a prediction.
+            excluded: Indices of the rows that are excluded because of warnings.
         """
+        rows = self._recording.rows
+        row = rows[index]
         if math.isinf(std):
-            return ""
-        row = self._recording.rows[index]
+            of_setup = [rows[i].line or 0 for i in excluded if rows[i].setup == row.setup]
+            if not of_setup:
+                return ""
+            where = spans(of_setup, "line")
+            text = f"No prediction: all other readings of this setup have a warning ({where})."
+            return self.wrap(text, indent="  ")
         of = ""
         if self.name(row) != row.setup:  # a coordinate of a point
             of = f" {row.setup.partition('[')[2].rstrip(']')}"
@@ -486,11 +509,11 @@ def _gauge(session: Session, setup: Setup) -> str:
         facts.append(f"{gauge.range[0] / MM:g} to {gauge.range[1] / MM:g} mm")
     if gauge.resolution is not None:
         facts.append(f"resolution {gauge.resolution / MM:g} mm")
-    if not facts and not setup.gauge:
+    name = session.distinguish_gauge(setup.gauge)
+    if not facts and not name:
         return ""
-    noun = instrument(setup.sensor)
-    name = f" {setup.gauge}" if setup.gauge not in ("", noun) else ""
-    return ": ".join(t for t in (f"{noun.capitalize()}{name}", ", ".join(facts)) if t)
+    noun = instrument(setup.sensor).capitalize()
+    return ": ".join(t for t in (f"{noun} '{name}'" if name else noun, ", ".join(facts)) if t)
 
 
 def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from browser import open_browser, visit
 from commands import run_orthocal
+from gauges import with_gauges
 from lxml import etree
 from machines import place
 
@@ -161,6 +162,29 @@ def test_alignment_posture_comes_before_the_first(small):
     steps = [words(li) for li in section.xpath(".//ol/li")]
     assert steps[0].startswith("Move to the alignment posture, which is also the first posture")
     assert "gauge zero" in steps[3]
+
+
+def test_each_setup_names_its_gauge_if_there_are_several(small, page):
+    fine = replace(small.gauge, resolution=1e-6)
+    gauge_of = {name: "fine" if i % 2 else "coarse" for i, name in enumerate(small.setups)}
+    two = with_gauges(
+        small,
+        {"coarse": small.gauge, "fine": fine},
+        [setup for setup, gauge in gauge_of.items() if gauge == "fine"],
+    )
+    files = sheet_files(two)
+    html = etree.HTML(files["sheet.html"])
+    programs = [text for name, text in sorted(files.items()) if name.endswith(".ngc")]
+    table = html.xpath("//table")[0]
+    column = [words(th) for th in table.xpath(".//th")].index("gauge")
+    named = [words(row.xpath("./td")[column]) for row in table.xpath(".//tr[td]")]
+    assert named == list(gauge_of.values())
+    for gauge, section, program in zip(named, sections(html), programs, strict=True):
+        step = "0.001" if gauge == "fine" else "0.01"
+        assert f"Gauge: {gauge}, -5 … 5 mm, read to {step} mm." in words(section)
+        assert f": mount gauge {gauge}, " in program
+    assert "gauge" not in [words(th) for th in page.xpath("//table")[0].xpath(".//th")]
+    assert not any("Gauge:" in words(section) for section in sections(page))
 
 
 def test_steps_state_how_to_mount_and_align_the_gauge(page):
