@@ -581,7 +581,7 @@ def _amount_of_change(session: Session, e: Explanation) -> str:
 
 
 def _other_offset(session: Session, e: Explanation) -> str:
-    """Clause about a drive with another offset than the stated one.
+    """Clause about a drive with another offset than the stated one, or a drive that moved.
 
     An offset that is too small by an amount has the effect of an offset error of this amount.
     """
@@ -594,7 +594,10 @@ def _other_offset(session: Session, e: Explanation) -> str:
     stated = float((session.robot.drive_zero - session.zero_drives[setups[0]])[drive])
     uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
     found = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
-    return f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}"
+    return (
+        f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}; or this "
+        f"drive or its home switch has moved{_amount_of_change(session, e)}"
+    )
 
 
 def _entered(e: Explanation, how: str) -> str:
