@@ -119,18 +119,21 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
     return Recommendation(complete, float(TRIAL_SCALES[best]), tuple(evidence), gain)
 
 
-def compute_log_evidence(session: Session, model: str) -> tuple[float, Array]:
+def compute_log_evidence(
+    session: Session, model: str, *, noise_effects: Sequence[str] | None = None
+) -> tuple[float, Array]:
     """Log evidence at the stated tolerances, and at all TRIAL_SCALES, shape (n_scales,).
 
     Args:
         session: The session, or several that were joined.
         model: Name of the model.
+        noise_effects: As for `LinearModel`, to compare sets of effects with the same noise.
     """
     total, by_scale = 0.0, np.zeros(TRIAL_SCALES.size)
     for part in split_sessions(session):
         if len(part.readings) < 2:  # one reading usually determines only a gauge zero
             continue
-        linear = linear_model(part, model)
+        linear = linear_model(part, model, noise_effects=noise_effects)
         about, scales = linear.most_likely(part.values), np.append(1.0, TRIAL_SCALES)
         evidence = weigh_scales(linear, about, part.values, scales)
         total += float(evidence[0])
