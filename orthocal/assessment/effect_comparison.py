@@ -5,7 +5,8 @@ are a part of the complete model, and their tolerances say how large they may be
 estimates them for the same reason, and decides for each drive what to enter. Other effects are
 added one after the other as long as the evidence for them is strong.
 
-The evidence is the marginal likelihood of the complete model with a set of effects. The
+The evidence is the marginal likelihood of the complete model with a set of effects. All sets have
+the same noise of several gauges, from readings that all effects together hardly change. The
 cross-validation error of setups is reported, but does not decide, as it depends on few readings.
 """
 
@@ -81,15 +82,17 @@ def compare_effects(session: Session) -> EffectComparison | None:
     present = [e.name for e in measurable_effects(session.robot)]
     not_measurable = [n for n in stated if n not in present]
     model = complete_model(session.robot.parameters)
+    all_effects = (*not_measurable, *order_effects(candidates))
     evidence_and_rms: dict[tuple[str, ...], tuple[float, float]] = {}
 
     def log_evidence(names: Sequence[str]) -> float:
         trial = order_effects(names)
         if trial not in evidence_and_rms:
             with_them = session.with_effects((*not_measurable, *trial))
-            errors = linear_model(with_them).predict_left_out(session.values)
-            rms = float(np.sqrt(np.mean(errors**2)))
-            evidence_and_rms[trial] = compute_log_evidence(with_them, model)[0], rms
+            linear = linear_model(with_them, noise_effects=all_effects)
+            rms = float(np.sqrt(np.mean(linear.predict_left_out(session.values) ** 2)))
+            evidence, _ = compute_log_evidence(with_them, model, noise_effects=all_effects)
+            evidence_and_rms[trial] = evidence, rms
         return evidence_and_rms[trial][0]
 
     log_evidence(())

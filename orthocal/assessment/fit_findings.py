@@ -31,6 +31,9 @@ from orthocal.statistics.zeros import project_out_zeros
 STANDSTILL = 1e-6
 """Change of a parameter, in prior standard deviations, below which it did not change."""
 
+UNUSUAL_ERROR = 3.0
+"""Error of an effect above which it is reported, [prior std]: 3 of 1000 are so large by chance."""
+
 NOTABLE_IDEALISATION = 1 / 3
 """Error by idealisation, in standard deviations of a reading, above which it is reported."""
 
@@ -66,6 +69,7 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
         *_convergence(calibration),
         *_standstill(calibration),
         *find_held(calibration),
+        *_above_tolerances(calibration),
         *_linearisation(calibration),
         *find_unresolved(calibration),
         *_idealisation(calibration),
@@ -173,6 +177,21 @@ def find_held(calibration: Calibration) -> list[Finding]:
         words.held_by_bound(p, offset=parameters.are_offsets(p.name))
         for p in calibration.free
         if p.at_bound is not None
+    ]
+
+
+def _above_tolerances(calibration: Calibration) -> list[Finding]:
+    """Findings about errors of effects, such as a backlash, far above their tolerances.
+
+    The tolerance scale of the machine allows for errors of legs and axes only.
+    """
+    parameters = calibration.robot.parameters
+    return [
+        words.effect_above_tolerance(p)
+        for p in calibration.free
+        if p.name in parameters.names
+        and not parameters.are_rigid(p.name)
+        and abs(p.value) > UNUSUAL_ERROR * p.prior_std
     ]
 
 

@@ -15,13 +15,14 @@ import numpy as np
 from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.effect_separability import find_unshown_effects
+from orthocal.assessment.exchanged_sides import find_exchanged_sides
 from orthocal.assessment.plausibility import (
     are_finer,
     find_finer,
     find_implausible,
     find_impossible_gauges,
 )
-from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
+from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import (
     describe_anomalies,

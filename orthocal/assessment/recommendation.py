@@ -26,7 +26,8 @@ from orthocal.errors import OrthocalError
 from orthocal.estimation.selection import complete_model
 from orthocal.estimation.tolerance_scale import trial_scales
 from orthocal.hypotheses.likelihood import NOISE_SCALES, log_normal, log_of_sum, noise_weights
-from orthocal.hypotheses.linear_model import linear_model
+from orthocal.hypotheses.linear_model import LinearModel, linear_model
+from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 
@@ -118,43 +119,59 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
     return Recommendation(complete, float(TRIAL_SCALES[best]), tuple(evidence), gain)
 
 
-def compute_log_evidence(session: Session, model: str) -> tuple[float, Array]:
+def compute_log_evidence(
+    session: Session, model: str, *, noise_effects: Sequence[str] | None = None
+) -> tuple[float, Array]:
     """Log evidence at the stated tolerances, and at all TRIAL_SCALES, shape (n_scales,).
 
     Args:
         session: The session, or several that were joined.
         model: Name of the model.
+        noise_effects: As for `LinearModel`, to compare sets of effects with the same noise.
     """
     total, by_scale = 0.0, np.zeros(TRIAL_SCALES.size)
     for part in split_sessions(session):
         if len(part.readings) < 2:  # one reading usually determines only a gauge zero
             continue
-        linear = linear_model(part, model)
-        linearisation = linear.most_likely(part.values)
-        deviation = linear.entries(part.values[None])[0] - linearisation.expected
-        noises, log_weights = np.ones(1), np.zeros(1)
-        if not linear.stated:
-            noises, log_weights = NOISE_SCALES, noise_weights(stated=False)
-        scales = np.append(1.0, TRIAL_SCALES)
-        likelihood = linearisation.likelihood
-        logs = likelihood.log_densities(likelihood.products(deviation[None]), scales, noises)
-        logs = logs.reshape(scales.size, noises.size)
-        positive = np.array([p.positive for p in linear.problem.parameters])
-        if positive.any():
-            logs += [
-                [
-                    linearisation.log_positive_share(
-                        deviation,
-                        positive,
-                        linear.reference / linear.problem.theta_scale,
-                        tolerance_scale=float(scale),
-                        noise_scale=float(noise),
-                    )
-                    for noise in noises
-                ]
-                for scale in scales
-            ]
-        evidence = log_of_sum(logs + log_weights, axis=1)
+        linear = linear_model(part, model, noise_effects=noise_effects)
+        about, scales = linear.most_likely(part.values), np.append(1.0, TRIAL_SCALES)
+        evidence = weigh_scales(linear, about, part.values, scales)
         total += float(evidence[0])
         by_scale += evidence[1:]
     return total, by_scale
+
+
+def weigh_scales(
+    linear: LinearModel, about: ModelLinearisation, values: Array, scales: Array
+) -> Array:
+    """Log evidence of readings at each tolerance scale, shape (n_scales,).
+
+    Args:
+        linear: The model.
+        about: Its linearisation.
+        values: Readings, shape (n_rows,), [m].
+        scales: Tolerance scales, shape (n_scales,).
+    """
+    deviation = linear.entries(values[None])[0] - about.expected
+    noises, log_weights = np.ones(1), np.zeros(1)
+    if not linear.stated:
+        noises, log_weights = NOISE_SCALES, noise_weights(stated=False)
+    likelihood = about.likelihood
+    logs = likelihood.log_densities(likelihood.products(deviation[None]), scales, noises)
+    logs = logs.reshape(scales.size, noises.size)
+    positive = np.array([p.positive for p in linear.problem.parameters])
+    if positive.any():
+        logs += [
+            [
+                about.log_positive_share(
+                    deviation,
+                    positive,
+                    linear.reference / linear.problem.theta_scale,
+                    tolerance_scale=float(scale),
+                    noise_scale=float(noise),
+                )
+                for noise in noises
+            ]
+            for scale in scales
+        ]
+    return log_of_sum(logs + log_weights, axis=1)

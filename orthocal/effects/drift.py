@@ -12,11 +12,11 @@ from typing import Self
 
 import casadi as ca
 
-from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.effects.protocol import Condition, Effect, EffectKeys, Symbols
 from orthocal.io.documents import PositiveNumber
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
-from orthocal.units import UM, read_limit
+from orthocal.units import UM, read_limit, show_limit
 
 
 class DriftKeys(EffectKeys):
@@ -50,3 +50,11 @@ class Drift(Effect):
     def reading(self, reading: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
         """Reading of the gauge (see `Effect.reading`)."""
         return reading + errors["drift"] * conditions["time"]
+
+    def negligible_difference(self, condition: Condition, change: float) -> float:
+        """Difference of time (see `Effect.negligible_difference`), [s].
+
+        The rate is at its tolerance.
+        """
+        (rate,) = self.setup_errors
+        return change / show_limit(rate.prior_std)

@@ -183,6 +183,9 @@ class Anomalies:
     """Most likely factor between the machine's errors and their tolerances."""
     noise_scale: float
     """Most likely factor between the noise and its stated standard deviation."""
+    suspected: tuple[int, ...] = ()
+    """Rows of the most likely further mistakes, if anomalies were found and do not explain the
+    readings."""
 
     @property
     def ambiguous(self) -> bool:

@@ -29,6 +29,7 @@ from orthocal.hypotheses.hypothesis import (
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
 from orthocal.observation.gauge_noise import assumed_sigma
+from orthocal.observation.observations import Observations, build_observations
 from orthocal.session.session import Session, split_label
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
@@ -72,6 +73,9 @@ class LinearModel:
     Args:
         session: A session, or several joined ones.
         names: Names of the errors that the machine may have; all by default.
+        noise_effects: Effects that change readings of one posture, so that their scatter shows the
+            noise of one of several gauges only without such a change; by default those of the
+            session.
         sigmas: Standard deviations of the entries of several gauges, shape (n_entries,), [m]; by
             default those of `initial_sigmas`.
 
@@ -83,6 +87,7 @@ class LinearModel:
         self,
         session: Session,
         names: Sequence[str] | None = None,
+        noise_effects: Sequence[str] | None = None,
         *,
         sigmas: Array | None = None,
     ) -> None:
@@ -96,7 +101,7 @@ class LinearModel:
         if len(gauges) == 1:
             sigmas = np.full(o.size, assumed_sigma(session.gauge))
         elif sigmas is None:
-            sigmas = initial_sigmas(session, o)
+            sigmas = _sigmas_of_entries(session, o, noise_effects)
         self._sigmas = sigmas
         self.stated = all(g.gauge.sigma is not None for g in gauges)
         self.sigma = float(sigmas[gauges[0].entries][0])
@@ -655,12 +660,15 @@ class LinearModel:
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 
-def linear_model(session: Session, model: str | None = None) -> LinearModel:
+def linear_model(
+    session: Session, model: str | None = None, *, noise_effects: Sequence[str] | None = None
+) -> LinearModel:
     """Linearised model of a session, cached for sessions with the same rows.
 
     Args:
         session: A session, or several joined ones.
         model: Name of the model of the errors that the machine may have; all errors by default.
+        noise_effects: As for `LinearModel`.
 
     Raises:
         RobotError: If closures of the robot depend on each other.
@@ -668,7 +676,24 @@ def linear_model(session: Session, model: str | None = None) -> LinearModel:
     """
     robot = session.robot
     names = machine_errors(robot) if model is None else robot.parameters.select_model(model)
-    return _cached_model(_Rows(session, names))
+    effects = None if noise_effects is None else tuple(noise_effects)
+    return _cached_model(_Rows(session, names, effects))
+
+
+def _sigmas_of_entries(
+    session: Session, o: Observations, noise_effects: Sequence[str] | None
+) -> Array:
+    """Standard deviation of each entry, shape (n_entries,), [m]; arguments as for `LinearModel`."""
+    if noise_effects is None:
+        return initial_sigmas(session, o)
+    with_effects = session.with_effects(noise_effects)
+    other = build_observations(with_effects)
+    sigmas, result = initial_sigmas(with_effects, other), np.empty(o.size)
+    for gauge, same in zip(
+        split_by_gauge(session, o), split_by_gauge(with_effects, other), strict=True
+    ):
+        result[gauge.entries] = sigmas[same.entries][0]
+    return result
 
 
 class _Rows:
@@ -677,8 +702,10 @@ class _Rows:
     With several gauges the values count, because their noise ratio may be estimated from them.
     """
 
-    def __init__(self, session: Session, names: tuple[str, ...]) -> None:
-        self.session, self.names = session, names
+    def __init__(
+        self, session: Session, names: tuple[str, ...], noise_effects: tuple[str, ...] | None
+    ) -> None:
+        self.session, self.names, self.noise_effects = session, names, noise_effects
         offsets = session.controller_offsets
         same_objects = (
             *(session.robot, session.postures, session.setups, *session.gauges.values()),
@@ -686,7 +713,7 @@ class _Rows:
         )
         self._key = (
             *map(id, same_objects),
-            *(None if offsets is None else offsets.tobytes(), session.joined, names),
+            *(None if offsets is None else offsets.tobytes(), session.joined, names, noise_effects),
             session.values.tobytes() if len(session.gauges_with_readings) > 1 else None,
             tuple(
                 (r.setup, r.posture, r.minus, r.cycle, r.line, r.file, r.conditions)
@@ -703,7 +730,7 @@ class _Rows:
 
 @lru_cache(maxsize=CACHE_SIZE)
 def _cached_model(rows: _Rows) -> LinearModel:
-    return LinearModel(rows.session, rows.names)
+    return LinearModel(rows.session, rows.names, rows.noise_effects)
 
 
 @lru_cache(maxsize=CACHE_SIZE)

@@ -102,12 +102,7 @@ def find_suspected_rows(session: Session) -> tuple[int, ...]:
         RobotError: If closures of the robot depend on each other.
     """
     search = _Search(session, linear_model(session))
-    families = list_families(search.model, Rows(session), grouped=False)
-    scored = list(search.scorer.score(search.sound, families))
-    least = max(float(e.max(initial=-np.inf)) for _, e in scored) - SIMILAR_LOG_BAYES
-    likely = [f.explain(int(h)) for f, e in scored for h in np.flatnonzero(e > least)]
-    rows = {i for e in likely for i in (e.rows[:1] if e.kind == "row offset" else e.rows)}
-    return tuple(sorted(rows))
+    return search.suspected_rows(search.sound)
 
 
 class _Search:
@@ -309,6 +304,15 @@ class _Search:
         mean, _ = self.model.predict_row(state.corrected, row)
         return float(state.corrected[row]) if math.isnan(mean) else mean
 
+    def suspected_rows(self, state: HypothesisSet) -> tuple[int, ...]:
+        """Rows of the most likely mistakes besides those of a state; see `find_suspected_rows`."""
+        families = list_families(self.model, Rows(self.session, state.corrected), grouped=False)
+        scored = list(self.scorer.score(state, families))
+        least = max(float(e.max(initial=-np.inf)) for _, e in scored) - SIMILAR_LOG_BAYES
+        likely = [f.explain(int(h)) for f, e in scored for h in np.flatnonzero(e > least)]
+        rows = {i for e in likely for i in (e.rows[:1] if e.kind == "row offset" else e.rows)}
+        return tuple(sorted(rows))
+
     def _result(
         self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]
     ) -> Anomalies:
@@ -333,15 +337,16 @@ class _Search:
                     alternatives,
                 )
             )
-        silent = any(t.silent is not None for t in state.terms)
+        explained = any(t.silent is not None for t in state.terms) or self.is_plausible(state)
         return Anomalies(
             tuple(anomalies),
             state.log_posterior - sound.log_posterior,
-            silent or self.is_plausible(state),
+            explained,
             self.model.rms(sound.remaining, sound.about),
             self.model.rms(state.remaining, state.about),
             state.score.tolerance_scale,
             state.score.noise_scale,
+            () if explained or not state.terms else self.suspected_rows(state),
         )
 
 

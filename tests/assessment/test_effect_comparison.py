@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from datetime import timedelta
 
 import numpy as np
 import pytest
 from calibrated import SOUND, UNJUDGED, session_of
-from effect_plans import ALL, FEW, effect_plan
+from effect_plans import ALL, FEW, FIRST, effect_plan
 from slack import Slack
 
 from orthocal import calibrate, simulate_session
@@ -21,6 +22,7 @@ from orthocal.effects import registry
 from orthocal.effects.registry import order_effects
 from orthocal.estimation.options import SolverOptions
 from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.session.session import Gauge
 
 QUICK = SolverOptions("variable-projection")
 ERRORS = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "y_slide.backlash": 50e-6}
@@ -73,6 +75,37 @@ def test_an_effect_whose_values_are_entered_is_recommended():
     assert (found.recommended, found.shown) == (("backlash",), ())
     entries = calibrate(session, "full", **UNJUDGED).assessment.backlash
     assert [bool(e.change) for e in entries] == [False, True, False]
+
+
+def test_an_effect_that_cannot_act_does_not_change_the_evidence(session):
+    """Drift within seconds. The scatter of repeated readings shows the noise of two gauges."""
+    rows = []
+    for name in session.setups:
+        of_setup = [r for r in session.readings if r.setup == name]
+        rows += [*of_setup, *(replace(of_setup[0], cycle=k) for k in (2, 3, 4))]
+    timed = [
+        replace(r, conditions=replace(r.conditions, time=FIRST + timedelta(seconds=k)))
+        for k, r in enumerate(rows)
+    ]
+    first, *_ = session.setups
+    plan = replace(
+        session,
+        readings=tuple(timed),
+        gauges={"dial": Gauge(2e-6), "digital": Gauge(1e-6)},
+        setups={
+            n: replace(s, gauge="dial" if n == first else "digital")
+            for n, s in session.setups.items()
+        },
+    )
+    noisy = simulate_session(plan, ERRORS, seed=4).session
+    values = noisy.values
+    values[[r.cycle == 2 for r in noisy.readings]] += 6e-6  # above the stated noise
+    found = compare_effects(noisy.with_values(values).with_effects(["backlash", "drift"]))
+    by_effects = {w.effects: w.log_evidence for w in found.weighed}
+    assert found.shown == ("backlash",)
+    assert by_effects["backlash",] > 10.0
+    assert by_effects["backlash", "drift"] == pytest.approx(by_effects["backlash",], abs=0.05)
+    assert by_effects["drift",] == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.fixture

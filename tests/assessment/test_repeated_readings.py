@@ -1,4 +1,4 @@
-"""Closing readings that differ from the first ones, and exchanged sides of approach."""
+"""Closing readings that differ from the first ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
-from conftest import ROOT
 from effect_plans import FIRST, effect_plan
 from models import TRUTH
 from planned import quick_plan
@@ -15,16 +14,13 @@ from planned import quick_plan
 from orthocal import (
     calibrate,
     check_session,
-    draw_errors,
     join_sessions,
-    load_plan,
     load_session,
     simulate_session,
     write_session,
 )
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.repeated_readings import find_exchanged_sides, find_scattered
-from orthocal.effects.compensation import JointTrim
+from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.observation.gauge_noise import usual_difference
@@ -195,56 +191,3 @@ def test_readings_at_nearly_the_same_temperature_repeat_each_other():
     # 0.1 K matters to a gauge of 0.1 µm
     session, observations = read_with_effect("thermal", [(20.0, 0), (20.1, 1)], Gauge(1e-7))
     assert estimate_repeatability(session.values, observations)[1] == 0
-
-
-@pytest.fixture(scope="module")
-def sided():
-    """Function from a seed to sound readings from both sides."""
-    plan = load_plan(ROOT / "examples/raw-cycles/plan.yaml").with_effects(["backlash"])
-    readings = tuple(
-        replace(r, conditions=Conditions(approach=3 * side))
-        for r in plan.readings
-        if r.cycle == 1
-        for side in "pn"
-    )
-    plan = replace(plan.with_controller(np.zeros(3)), readings=readings)
-    plan = plan.with_gauge(Gauge(5e-6, 1e-5))
-
-    def simulate(seed):
-        errors = draw_errors(plan.robot, ["*"], seed=seed, tolerances={"*.offset_mm": 4.0})
-        return simulate_session(plan, errors | BACKLASHES, seed=seed).session
-
-    return simulate
-
-
-def with_exchanged_sides(session, setups):
-    turned = str.maketrans("pn", "np")
-    readings = tuple(
-        replace(r, conditions=replace(r.conditions, approach=r.approach.translate(turned)))
-        if r.setup in setups
-        else r
-        for r in session.readings
-    )
-    return replace(session, readings=readings)
-
-
-@pytest.mark.parametrize("which", [slice(None), slice(1, 2)], ids=["all", "2"])
-def test_exchanged_sides_are_named_with_their_setups(sided, which):
-    session = sided(3)
-    setups = list(session.setups)[which]
-    (finding,) = find_exchanged_sides(with_exchanged_sides(session, setups))
-    assert {p.setup for p in finding.places} <= set(setups)
-    assert all(name in finding.text for name in setups)
-    assessment = check_session(with_exchanged_sides(session, setups))
-    assert assessment.decision.verdict == "review"
-
-
-def test_sides_of_sound_sessions_are_not_exchanged(sided):
-    """Also where the controller compensates too much, or nothing is left of the backlash."""
-    for seed in range(20):
-        session = sided(seed)
-        assert find_exchanged_sides(session) == ()
-        trims = tuple(JointTrim(v + 10e-6) for v in BACKLASHES.values())
-        plan = replace(session, compensation=trims)
-        errors = draw_errors(plan.robot, ["*.offset"], seed=seed) | BACKLASHES
-        assert find_exchanged_sides(simulate_session(plan, errors, seed=seed).session) == ()

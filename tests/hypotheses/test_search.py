@@ -23,6 +23,7 @@ from orthocal import (
     make_robot,
     simulate_session,
 )
+from orthocal.assessment.words.anomalies import describe_anomalies
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
@@ -113,6 +114,24 @@ def test_a_factor_is_named_only_if_the_dial_can_show_the_corrected_readings(cycl
     random = np.random.default_rng(3).uniform(-2e-3, 2e-3, len(one.values))
     found = anomalies(one.with_values(np.round(random, 5)))
     assert "inconsistent readings" in {f.kind for f in found}
+
+
+def test_the_likeliest_of_further_wrong_readings_are_named(cycles):
+    """Of five wrong readings some are found; the action repeats one of the others."""
+    _, *wrong = [rows[4] for rows in Rows(cycles).setups.values()][::-1]
+    values = cycles.values
+    values[wrong] += np.array([2.2, -0.9, 1.9, -2.7, 1.3]) * 1e-3
+    result = find_anomalies(cycles.with_values(values))
+    named = {i for a in result.found for i in a.explanation.rows}
+    assert result.found
+    assert not result.explained
+    assert result.suspected
+    assert set(result.suspected) <= set(wrong) - named
+    *_, finding = describe_anomalies(cycles.with_values(values), result)
+    assert finding.kind == "inconsistent readings"
+    lines = [cycles.readings[i].line for i in result.suspected]
+    assert [p.line for p in finding.places] == lines
+    assert f"`repeat {lines[0]}`" in finding.action
 
 
 def test_reversed_signs_of_all_readings_are_not_identifiable(cycles):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import tracemalloc
 from dataclasses import replace
 from datetime import datetime
@@ -9,10 +11,11 @@ from datetime import datetime
 import numpy as np
 import pytest
 from calibrated import plan_of
+from commands import run_orthocal
 from effect_plans import effect_plan
 from made_mistakes import sound_session
 
-from orthocal import draw_errors, simulate_session
+from orthocal import calibrate, draw_errors, load_calibration, simulate_session, write_session
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.compensation import JointTrim
 from orthocal.errors import SessionError
@@ -80,6 +83,27 @@ def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
     else:  # the change of the machine that has the same effect
         assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
     assert found.explained
+
+
+def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, tmp_path):
+    """The stated offsets are right, so the new session alone is calibrated, as the action says."""
+    parts = measure_twice(plan, ENTERED, changed=0.8e-3).parts
+    paths = [write_session(part, tmp_path / f"day {k}").parent for k, part in enumerate(parts)]
+    found = calibrate(paths, "full").assessment
+    (finding,) = found.of_kind("offset of one drive")
+    assert found.decision.verdict == "review"
+    assert "drive or its home switch has moved by" in finding.text
+    by, std = (finding.numbers[f"y_slide.offset_{what}_mm"] for what in ("by", "std"))
+    assert abs(by - 0.8) < 3.0 * std < 0.2
+    (command,) = re.findall(r"`orthocal (calibrate .*)`", finding.action)
+    action, path, option, out = shlex.split(command)
+    assert (action, path, option) == ("calibrate", str(paths[1]), "--out")
+    assert run_orthocal(tmp_path, action, path, option, out).returncode == 0
+    calibration = load_calibration(out)
+    after = ENTERED + 10e-6 + [0.0, 0.8e-3, 0.0]
+    for drive, true in zip(plan.robot.drives, after, strict=True):
+        (offset,) = [p for p in calibration.free if p.name == f"{drive.name}.offset"]
+        assert abs(offset.value - true) < min(2.0 * offset.std, 0.4e-3)  # half of the slip
 
 
 def test_readings_that_are_not_possible_do_not_end_the_search(plan, monkeypatch):

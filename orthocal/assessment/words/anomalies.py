@@ -164,15 +164,26 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
     """Finding about readings that the anomalies do not explain, or explain only in part."""
     what = "What was found above explains" if result.found else "No single change explains"
     which = "The sessions do" if session.joined else "The readings do"
+    suspected = Explanation("outlier", "reading", result.suspected)
+    where, action = "", "Measure again."
+    if result.suspected:
+        names = list(dict.fromkeys(session.readings[i].setup for i in result.suspected))
+        setups = f"setup{'s' * (len(names) > 1)} {joined(names)}"
+        lines = _lines(session, suspected).removesuffix(": ")
+        where = f", most likely in {f'{lines} ({setups})' if lines else setups}"
+        action = advise_repetition(session, suspected)
+    if session.joined:
+        action = (
+            "Read a setup of the session that was measured last again. If its readings repeat, the "
+            "machine has changed: calibrate that session alone. Otherwise measure again."
+        )
     return review(
         "inconsistent readings",
         f"{which} not fit one machine. {what} "
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
-        "readings are wrong.",
-        "Read a setup of the session that was measured last again. If its readings repeat, the "
-        "machine has changed: calibrate that session alone. Otherwise measure again."
-        if session.joined
-        else "Measure again.",
+        f"readings are wrong{where}.",
+        action,
+        _places(session, suspected),
         before_rms_um=result.rms_before / UM,
         after_rms_um=result.rms_after / UM,
     )
@@ -578,7 +589,7 @@ def _amount_of_change(session: Session, e: Explanation) -> str:
 
 
 def _other_offset(session: Session, e: Explanation) -> str:
-    """Clause about a drive with another offset than the stated one.
+    """Clause about a drive with another offset than the stated one, or a drive that moved.
 
     An offset that is too small by an amount has the effect of an offset error of this amount.
     """
@@ -591,7 +602,10 @@ def _other_offset(session: Session, e: Explanation) -> str:
     stated = float((session.robot.drive_zero - session.zero_drives[setups[0]])[drive])
     uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
     found = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
-    return f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}"
+    return (
+        f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}; or this "
+        f"drive or its home switch has moved{_amount_of_change(session, e)}"
+    )
 
 
 def _entered(e: Explanation, how: str) -> str:

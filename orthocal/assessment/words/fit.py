@@ -8,7 +8,7 @@ from orthocal.assessment.wording import counted, mm, note, parameter_places, pla
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
-from orthocal.units import MM
+from orthocal.units import MM, show_limit
 
 MAX_LISTED = 6
 """Number of parameters above which they are not listed."""
@@ -184,6 +184,22 @@ def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
             * parameter.edge_factor
         },
         parameter_places(parameter.name),
+    )
+
+
+def effect_above_tolerance(parameter: ParameterEstimate) -> Finding:
+    """Finding about an error of an effect, such as a backlash, far above its tolerance."""
+    unit, factor = parameter.edge_unit, parameter.edge_factor
+    tolerance = show_limit(parameter.prior_std)
+    return note(
+        "above tolerances",
+        f"{parameter.name} is estimated to be {plain(parameter.value * factor)} {unit}, "
+        f"{times(abs(parameter.value) / tolerance)} its tolerance. With so small a tolerance the "
+        "estimate is too small.",
+        "Check this part of the machine. If it is so far off, state a larger tolerance and "
+        "calibrate again.",
+        parameter_places(parameter.name),
+        **{f"value_{unit}": parameter.value * factor, f"tolerance_{unit}": tolerance * factor},
     )
 
 

@@ -326,7 +326,7 @@ def exchanged_sides(
     """Finding about setups whose readings show a backlash with the opposite sign.
 
     Args:
-        lines: Their lines with both sides, if they are known.
+        lines: Their lines with stated sides, if they are known.
         setups: Their names.
         places: Places of their readings.
     """
@@ -334,8 +334,8 @@ def exchanged_sides(
     noun, these = ("setup", "this setup") if len(setups) == 1 else ("setups", "these setups")
     return review(
         "sides exchanged",
-        f"In {noun} {joined(setups)}, readings of one posture from both sides differ with the sign "
-        f"opposite to a backlash{where}: the sides of approach seem to be exchanged.",
+        f"In {noun} {joined(setups)}{where} the effect of the backlash has the opposite sign: the "
+        "sides of approach seem to be exchanged.",
         "Check the column `approach`: p if the coordinate of a drive grew in its last motion, n if "
         f"it fell. Correct it, or read {these} again. If it is right, the controller compensates "
         "more backlash than the session states.",

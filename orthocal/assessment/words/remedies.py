@@ -154,9 +154,11 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
             "Home the machine, go to the first posture of a setup and read it again. If it has "
             f"changed, look for the cause at {joined(e.drives)}, and measure the session again."
         )
+    if e.kind == "offset of one drive":
+        return _advise_other_offset(session, e)
     if e.kind != "machine changed":
         number = "backlash" if e.kind.startswith("backlash") else "offsets"
-        key = f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
+        key = _key_of_controller(session, number)
         which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
         note = f" {OFFSETS_IN_LINUXCNC}" if number == "offsets" else ""
         if e.kind in ("backlash halved", "backlash entered twice"):
@@ -183,6 +185,39 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
         "offsets entered in between look the same. Otherwise: "
         f"{uncapitalised(calibrate_apart)}"
     )
+
+
+def _key_of_controller(session: Session, number: str) -> str:
+    """Key of session.yaml that states the offsets or backlashes of the controller."""
+    return f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
+
+
+def _advise_other_offset(session: Session, e: Explanation) -> str:
+    """Action after an offset of one drive that differs from the stated one."""
+    return (
+        "Compare the offsets in the controller with "
+        f"`{_key_of_controller(session, 'offsets')}` of session {e.sessions[0]}. {OFFSETS_IN_LINUXCNC} "
+        "If they differ, state there those that were in the controller, and calibrate again. If they agree, the "
+        f"drive or its home switch has moved: {_calibrate_present(session, e)}, and enter its "
+        "offsets."
+    )
+
+
+def _calibrate_present(session: Session, e: Explanation) -> str:
+    """Clause with the command that calibrates the sessions since a change without earlier ones."""
+    names = list(dict.fromkeys(session.labels))
+    present = e.sessions if e.apart else names[names.index(e.sessions[0]) :]
+    which = f"session{'s' * (len(present) > 1)} {joined(present)}"
+    clause = f"calibrate {which} without the others"
+    paths = [part.path for part in session.parts]
+    if len(paths) != len(names) or None in paths:
+        return clause
+    directories = [
+        printable(shlex.quote(str(path.parent)))
+        for name, path in zip(names, paths, strict=True)
+        if name in present and path is not None
+    ]
+    return f"{clause} (`orthocal calibrate {' '.join(directories)} --out {directories[0]}-alone`)"
 
 
 def advise_effects(session: Session, explanations: Iterable[Explanation]) -> str:
