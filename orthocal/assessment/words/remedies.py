@@ -194,12 +194,12 @@ def _key_of_controller(session: Session, number: str) -> str:
 
 def _advise_other_offset(session: Session, e: Explanation) -> str:
     """Action after an offset of one drive that differs from the stated one."""
+    key = _key_of_controller(session, "offsets")
     return (
-        "Compare the offsets in the controller with "
-        f"`{_key_of_controller(session, 'offsets')}` of session {e.sessions[0]}. {OFFSETS_IN_LINUXCNC} "
-        "If they differ, state there those that were in the controller, and calibrate again. If they agree, the "
-        f"drive or its home switch has moved: {_calibrate_present(session, e)}, and enter its "
-        "offsets."
+        f"Compare the offsets in the controller with `{key}` of session {e.sessions[0]}. "
+        f"{OFFSETS_IN_LINUXCNC} If they differ, state there those that were in the controller, and "
+        "calibrate again. If they agree, the drive or its home switch has moved: "
+        f"{_calibrate_present(session, e)}, and enter its offsets."
     )
 
 
