@@ -103,6 +103,9 @@ def validate(folder, before, session, mistake, counts):
     """Verdicts on sessions with another one that was measured after their calibration."""
     write_session(session, folder / "again")
     done = run_orthocal(folder, "validate", "full", "again", "--json")
+    if done.returncode == 2:  # with the stated offsets a posture is beyond the travel
+        counts.validated[mistake, None, "refused"] += 1
+        return {"validate": "refused"}
     document = json.loads(done.stdout)
     decision, confirmed = document["decision"], document["confirmed"]
     counts.validated[mistake, confirmed, decision["verdict"]] += 1

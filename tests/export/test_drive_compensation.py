@@ -414,6 +414,18 @@ def test_a_switch_at_a_limit_stays_within_the_limits(calibration, end):
     assert outside == 3  # for one of both directions of latching each
 
 
+def test_limits_that_an_earlier_export_widened_contain_the_switch(calibration):
+    """The INI file in use states them, so the travel of the robot does not narrow them."""
+    drives = zip(calibration.robot.drives, ACTIVE, strict=True)
+    travel = [np.array(d.joint_limits) + d.direction * active for d, active in drives]
+    widened = tuple((low, high + 20e-6) for low, high in map(tuple, travel))
+    old = tuple(high for _, high in widened)
+    stated = ExportOptions(module=False, latched=(1, 1, 1), home_offsets=old, joint_limits=widened)
+    lines = export_calibration(calibration, "linuxcnc", anyway=True, options=stated)["joints.ini"]
+    high = [float(v) for v in re.findall(r"^MAX_LIMIT = (\S+)", lines, re.M)]
+    assert all(home <= limit for home, limit in zip(home_offsets(lines), high, strict=True))
+
+
 def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):
     """Homed at the switch, it would refuse to move if HOME_OFFSET were outside the soft limits.
 

@@ -105,7 +105,7 @@ def find_homes(
         before: Compensation during the measurement.
         old: HOME_OFFSET of each joint during the measurement, [m, rad].
         stated_limits: Soft limits of each joint during the measurement, [m, rad]. The narrower ones
-            of these and of the robot's travel count.
+            of these and of the robot's travel count, and contain HOME_OFFSET if these do.
 
     Raises:
         ParameterError: If the numbers of old values and drives differ.
@@ -122,11 +122,12 @@ def find_homes(
     active = calibration.session.controller_offsets
     homes = []
     for i, d in enumerate(drives):
+        home, joint = None if old is None else old[i], compensation[i]
         limits = None if stated_limits is None else stated_limits[i]
         if active is not None:
-            limits = _intersect(np.array(d.joint_limits) + d.direction * active[i], limits)
+            travel = np.array(d.joint_limits) + d.direction * active[i]
+            limits = _intersect(travel, limits, home)
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
-        home, joint = None if old is None else old[i], compensation[i]
         home_changes = [0.0, 0.0]
         for k, opposite in enumerate((False, True)):
             trim = old_trim = before[i].trim_at_home(home, opposite=opposite)
@@ -151,7 +152,15 @@ def find_homes(
     return tuple(homes)
 
 
-def _intersect(travel: Array, stated: tuple[float, float] | None) -> tuple[float, float]:
-    """Limits that a joint's travel, shape (2,), and its stated limits have in common, [unit]."""
+def _intersect(
+    travel: Array, stated: tuple[float, float] | None, home: float | None
+) -> tuple[float, float]:
+    """Limits that a joint's travel, shape (2,), and its stated limits have in common, [unit].
+
+    They contain HOME_OFFSET if the stated limits do: an earlier export may have widened these.
+    """
     low, high = stated or (-np.inf, np.inf)
-    return max(float(travel[0]), low), min(float(travel[1]), high)
+    lowest, highest = max(float(travel[0]), low), min(float(travel[1]), high)
+    if stated is not None and home is not None and low <= home <= high:
+        return min(lowest, home), max(highest, home)
+    return lowest, highest
