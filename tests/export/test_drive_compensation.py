@@ -16,7 +16,7 @@ from commands import run_orthocal
 from effect_plans import write_plan
 from linuxcnc import Joint, few_nodes, play, require_linuxcnc, run_program
 from programs import read_polyline
-from test_linuxcnc import Core, from_pieces, require_followed
+from test_linuxcnc import Core, from_pieces, homes_of, require_followed
 
 from orthocal import (
     Choice,
@@ -39,6 +39,7 @@ from orthocal.effects.compensation import JointTrim
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
 from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors, find_periodic_errors
+from orthocal.export.linuxcnc.instructions import describe_compensation
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
@@ -424,6 +425,18 @@ def test_limits_that_an_earlier_export_widened_contain_the_switch(calibration):
     lines = export_calibration(calibration, "linuxcnc", anyway=True, options=stated)["joints.ini"]
     high = [float(v) for v in re.findall(r"^MAX_LIMIT = (\S+)", lines, re.M)]
     assert all(home <= limit for home, limit in zip(home_offsets(lines), high, strict=True))
+
+
+def test_a_backlash_that_does_not_change_needs_no_direction_of_latching(calibration):
+    homes = homes_of(calibration)
+    assert any(home.compensation.backlash for home in homes)
+    changed, same = (
+        describe_compensation(joints, stated=False, module=True)
+        for joints in (homes, [replace(home, was=home.compensation) for home in homes])
+    )
+    assert "latched in" in changed
+    assert "latch" not in same.lower()
+    assert "as during the measurement" in same
 
 
 def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):

@@ -337,8 +337,9 @@ def exchanged_sides(
         f"In {noun} {joined(setups)}{where} the effect of the backlash has the opposite sign: the "
         "sides of approach seem to be exchanged.",
         "Check the column `approach`: p if the coordinate of a drive grew in its last motion, n if "
-        f"it fell. Correct it, or read {these} again. If it is right, the controller compensates "
-        "more backlash than the session states.",
+        "it fell; a joint that counts down displays the opposite. Correct it, or read "
+        f"{these} again. If it is right, the controller compensates more backlash than the session "
+        "states.",
         places,
     )
 

@@ -74,6 +74,12 @@ class JointHome:
         return low, high
 
     @property
+    def compensation_changes(self) -> bool:
+        """True if the controller's compensation is another one than during the measurement."""
+        new, old = self.compensation, self.was
+        return new.table is not old.table or abs(new.backlash - old.backlash) > SAME_POSITION
+
+    @property
     def joint_unit(self) -> str:
         """Unit of the joint in LinuxCNC: mm or deg."""
         return DRIVE_UNITS[self.unit][0]

@@ -153,9 +153,7 @@ def _compensation_lines(joint: int, home: JointHome) -> list[str]:
     return lines
 
 
-def _describe_compensation(
-    homes: Sequence[JointHome], *, stated: bool, module: bool = False
-) -> str:
+def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: bool = False) -> str:
     """Paragraph about BACKLASH and COMP_FILE; empty without them.
 
     Args:
@@ -165,7 +163,14 @@ def _describe_compensation(
     """
     paragraphs = []
     with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
-    if with_backlash:
+    if with_backlash and not any(h.compensation_changes for h in homes):
+        listed = ", ".join(
+            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.joint_unit}" for i, h in with_backlash
+        )
+        paragraphs.append(
+            f"**Backlash:** {listed}, as during the measurement. Keep these lines BACKLASH."
+        )
+    elif with_backlash:
         listed = ", ".join(
             f"JOINT_{i} {h.show(h.compensation.backlash)} {h.joint_unit} (latched in "
             f"{'+' if h.compensation.latched > 0 else '-'} direction)"
@@ -321,7 +326,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "scope": scope,
         "table": "\n".join(rows),
         "active": f"`{_describe_offsets(calibration)}`" if stated_offsets else UNSTATED,
-        "compensation": _describe_compensation(homes, stated=stated)
+        "compensation": describe_compensation(homes, stated=stated)
         + _describe_undetermined(calibration)
         + _describe_undetermined_screws(calibration),
     }
@@ -373,7 +378,7 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
-        "compensation": _describe_compensation(homes, stated=stated, module=True)
+        "compensation": describe_compensation(homes, stated=stated, module=True)
         + _describe_conditions(approximation)
         + _describe_undetermined(calibration),
         "old_values": f" ({', '.join(old)})" if old else "",
