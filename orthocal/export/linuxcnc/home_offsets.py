@@ -111,7 +111,7 @@ def find_homes(
         before: Compensation during the measurement.
         old: HOME_OFFSET of each joint during the measurement, [m, rad].
         stated_limits: Soft limits of each joint during the measurement, [m, rad]. The narrower ones
-            of these and of the robot's travel count, and contain HOME_OFFSET if these do.
+            of these and of the robot's travel count, except for a stated limit at HOME_OFFSET.
 
     Raises:
         ParameterError: If the numbers of old values and drives differ.
@@ -163,10 +163,12 @@ def _intersect(
 ) -> tuple[float, float]:
     """Limits that a joint's travel, shape (2,), and its stated limits have in common, [unit].
 
-    They contain HOME_OFFSET if the stated limits do: an earlier export may have widened these.
+    A stated limit at HOME_OFFSET counts beyond the travel: an earlier export has widened it.
     """
     low, high = stated or (-np.inf, np.inf)
-    lowest, highest = max(float(travel[0]), low), min(float(travel[1]), high)
-    if stated is not None and home is not None and low <= home <= high:
-        return min(lowest, home), max(highest, home)
+    at_low, at_high = (
+        home is not None and abs(home - limit) < SAME_POSITION for limit in (low, high)
+    )
+    lowest = low if at_low else max(float(travel[0]), low)
+    highest = high if at_high else min(float(travel[1]), high)
     return lowest, highest
