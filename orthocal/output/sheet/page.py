@@ -47,7 +47,7 @@ SHEET = "sheet.html"
 
 END = (
     "Compare the last reading with {}: posture and approach are the same. If they differ by more "
-    "than {}, repeat this setup: the gauge or the machine was displaced. "
+    "than {}, read this setup again: the gauge or the machine was displaced. "
 )
 """Check after the readings of a setup: the first reading, and the largest usual difference."""
 
@@ -58,7 +58,7 @@ FROM_ANOTHER_SIDE = (
 
 END_OF_POINTS = (
     "Compare the points of the first posture with each other. If they differ by more than the "
-    "instrument scatters, repeat this setup: the instrument or the machine was displaced. "
+    "instrument scatters, read this setup again: the instrument or the machine was displaced. "
 )
 """The same for points."""
 
