@@ -1,6 +1,8 @@
 # Everything a fresh machine with Python 3.11 or newer and make needs.
 #   make calibrate   set up, and calibrate the paper's Experiment 2
-#   make test        set up with the test tools, and run all checks
+#   make test        set up with the test tools, and run all checks that need Python alone
+#   make acceptance  the wheel, commands of the pages, pages in a browser, exports in LinuxCNC
+#   make benchmarks  ratios of processor times
 #   make smoke       a few tests on other Pythons and with the lowest versions of dependencies
 #   make docs        set up with the tools for pages, and write them to out/docs
 
@@ -21,24 +23,28 @@ $(PIP) uv && $(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python --ed
 	  $(PIP) --no-compile --editable '$(1)'
 endef
 
+PYTEST_IN_PARALLEL = $(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal \
+  --ignore tests/benchmarks
+
 unexport PYTHONDONTWRITEBYTECODE  # processes of tests do not compile what others have compiled
 
-.PHONY: calibrate test compiled suite benchmarks smoke check docs clean
+.PHONY: calibrate test compiled suite acceptance benchmarks smoke check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED)
-	@# two processes at first: a benchmark compares times
-	$(MAKE) --jobs 2 --output-sync check benchmarks compiled
+	$(MAKE) --jobs 2 --output-sync check compiled
 	$(MAKE) suite
 
 compiled: $(TESTED)  # the tests, once for all workers
 	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
 
 suite: $(TESTED)
-	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
-	  --ignore tests/benchmarks
+	$(PYTEST_IN_PARALLEL) -m "not smoke and not acceptance"
+
+acceptance: $(TESTED)
+	$(PYTEST_IN_PARALLEL) -m acceptance
 
 benchmarks: $(TESTED)  # in one process: they compare seconds of the processor
 	$(VENV)/bin/python -m pytest tests/benchmarks

@@ -38,6 +38,8 @@ from orthocal.assessment.controller_entries import find_entries
 from orthocal.observation.simulate import collect_errors
 from orthocal.units import MM
 
+pytestmark = pytest.mark.acceptance
+
 DIMENSIONS = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60
 --rod-radius-mm 4 --counts up,down,up --at-zero-mm 0 --effects none --paper"""
 

@@ -23,7 +23,7 @@ from orthocal.planning import selection
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
-pytestmark = pytest.mark.usefixtures("short_reports")
+pytestmark = [pytest.mark.acceptance, pytest.mark.usefixtures("short_reports")]
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 

@@ -11,6 +11,8 @@ from email.parser import HeaderParser
 import pytest
 from environments import declared, make_environment
 
+pytestmark = pytest.mark.acceptance
+
 
 @pytest.fixture(scope="module")
 def wheel(root, tmp_path_factory):

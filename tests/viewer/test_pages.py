@@ -20,6 +20,8 @@ from orthocal import LiveScene, draw_scene
 from orthocal.output.report.parameter_plots import plot_correlations
 from orthocal.viewer.browser import take_picture
 
+pytestmark = pytest.mark.acceptance
+
 EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")
 
 
