@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import ProgramCorrector, Summary
     from orthocal.kinematics.conditions import UseCondition
+    from orthocal.kinematics.workspace import Workspace
 
     Array = NDArray[np.float64]
 
@@ -238,6 +239,8 @@ class _Correction:
         ]
         if not self.controller.work_offsets:
             notes.append("The program's coordinates are read as machine coordinates.")
+        if self.region:
+            notes.append("A work zero that was touched off without correction remains valid.")
         if summary.unit_assumed:
             notes.append("No G20 or G21 before the first coordinates: read as mm.")
         return notes
@@ -264,7 +267,12 @@ def _prepare(
         result.robot, temperature=options.temperature, payload=options.payload
     )
     field = CorrectionField(
-        result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0), conditions=conditions
+        result,
+        values,
+        within=tolerance,
+        tool=tip or (0.0, 0.0, 0.0),
+        conditions=conditions,
+        aligned_over=_find_workspace(result),
     )
     interpreter = Interpreter(
         file,
@@ -436,6 +444,15 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
         f"path is within {bound / UM:.2g} µm of the exact correction (limit {within / UM:g} µm). "
         f"Feeds change by at most {change:.2f} %, so that the tool keeps its speed."
     )
+
+
+def _find_workspace(result: orthocal.Calibration) -> Workspace | None:
+    """Workspace of the assessment; None without a reachable one."""
+    from orthocal.assessment.assess import assessment_of
+    from orthocal.kinematics.workspace import box_workspace
+
+    tool = assessment_of(result).tool
+    return None if tool is None else box_workspace(result.robot, tool.box)
 
 
 def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:

@@ -5,6 +5,11 @@ calibrated machine is at p if the drives are at c(p) (`tool_tip.py`). The point 
 therefore f(c(p) + o), with f the nominal forward kinematics. Displacements of the drives by the
 controller (tables of trims) are subtracted before.
 
+A work zero is touched off by motions without correction, whose errors contain a common shift and
+rotation. Without them the corrected program would not meet the touched-off workpiece. So the
+desired points are first moved by the translation and rotation that best map commanded points to
+the tips of the machine without correction.
+
 This exact correction takes up to a millisecond per point, and it is smooth. So it is interpolated
 by a polynomial in each box of a grid. The polynomial is computed for the first point in the box and
 checked against the exact correction at other points. A box that is not accurate enough, or not
@@ -28,7 +33,7 @@ from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import grid_points
+from orthocal.kinematics.workspace import Workspace, grid_points
 
 POLYNOMIAL_TOLERANCE = 0.1
 """Largest error of the polynomials, relative to the tolerance of the path."""
@@ -89,8 +94,11 @@ class CorrectionField:
         within: Tolerance of the corrected path, [m]; the field uses a part of it.
         tool: Tip in the frame of the robot's tool centre point, [m].
         conditions: Conditions of use; defaults as for `ToolTip`.
+        aligned_over: Commanded points over which the desired points are aligned with the machine
+            without correction; by default they are not aligned.
 
     Raises:
+        ClosureError: If a point of `aligned_over` is out of reach.
         ExportError: If the robot's drives do not command the tool.
         ParameterError: If the tip is out of range.
     """
@@ -103,6 +111,7 @@ class CorrectionField:
         within: float,
         tool: tuple[float, float, float] = (0.0, 0.0, 0.0),
         conditions: UseConditions | None = None,
+        aligned_over: Workspace | None = None,
     ) -> None:
         robot = calibration.robot
         self._tip = ToolTip(calibration, tool, conditions=conditions)
@@ -113,6 +122,9 @@ class CorrectionField:
         self._offsets = np.array(offsets, dtype=np.float64)
         self._displacement = calibration.displacement
         self._nominal = nominal_closure(robot)
+        self._rotation, self._translation = np.eye(3), np.zeros(3)
+        if aligned_over is not None:
+            self._rotation, self._translation = self._align(aligned_over)
         self._side = BOX_SIDE * robot.characteristic_length
         self._boxes: dict[Key, _Box | Fallback] = {}
         self._largest_error = EXACT_ERROR
@@ -177,7 +189,7 @@ class CorrectionField:
         for first in range(0, len(points), BATCH_SIZE):
             batch = points[first : first + BATCH_SIZE]
             failures: Failures = {}
-            motors = self._tip.reach(batch, failures=failures)[0] + self._offsets
+            motors = self._tip.reach(self._move(batch), failures=failures)[0] + self._offsets
             drives = motors - self._displacement(motors)
             drives = motors - self._displacement(drives)
             reached = np.array([i for i in range(len(batch)) if i not in failures], dtype=np.int64)
@@ -189,6 +201,42 @@ class CorrectionField:
                 refused[first + i] = e.reason
                 corrected[first + i] = np.nan
         return corrected, refused
+
+    def _align(self, workspace: Workspace) -> tuple[Array, Array]:
+        """Rotation and translation that best map commanded points to uncorrected tips.
+
+        Returns:
+            Rotation R, shape (3, 3), and translation t, shape (3,), [m]: R p + t.
+        """
+        from scipy.spatial.transform import Rotation
+
+        drives = self._nominal.inverse(workspace.points)
+        motors = drives + self._displacement(drives)
+        desired, actual = (
+            self._in_space(points)
+            for points in (
+                self._tip.targets(workspace.points),
+                self._tip.place(motors - self._offsets),
+            )
+        )
+        middles = [workspace.weights @ points for points in (desired, actual)]
+        fitted, _ = Rotation.align_vectors(
+            actual - middles[1], desired - middles[0], weights=workspace.weights
+        )
+        rotation = np.asarray(fitted.as_matrix())
+        return rotation, np.asarray(middles[1] - rotation @ middles[0])
+
+    def _move(self, points: Array) -> Array:
+        """Commanded points moved by the rotation and translation at their tips, shape (k, n)."""
+        tips = self._in_space(self._tip.targets(points))
+        moved = tips @ self._rotation.T + self._translation
+        return np.asarray(points + (moved - tips)[:, list(self.axes)])
+
+    def _in_space(self, points: Array) -> Array:
+        """Points with all three coordinates, those without a drive at 0, shape (k, 3), [m]."""
+        result = np.zeros((len(points), 3))
+        result[:, list(self.axes)] = points
+        return result
 
     def _correct_exactly(
         self, desired: Array, commanded: Array, indices: list[int], refused: dict[int, str]

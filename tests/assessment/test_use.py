@@ -12,6 +12,8 @@ import pytest
 from commands import run_orthocal
 from conftest import no_sensor_gains
 from effect_plans import write_plan, write_robot
+from programs import read_polyline
+from scipy.spatial.distance import pdist
 
 from orthocal import (
     Choice,
@@ -372,7 +374,9 @@ def test_accuracy_is_under_stated_conditions(folder, calibration):
 
 
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, calibration):
-    (folder / "part.ngc").write_text("G21\nG0 X0 Y0 Z0\nG0 X10 Y-20 Z5\n")
+    points = np.array([[0.0, 0.0, 0.0], [10.0, -20.0, 5.0], [-15.0, 25.0, 10.0], [5.0, 5.0, -30.0]])
+    lines = [f"N{n} G0 X{x} Y{y} Z{z}" for n, (x, y, z) in enumerate(points, start=1)]
+    (folder / "part.ngc").write_text("\n".join(["G21", *lines, ""]))
     words = ("correct", ".", "part.ngc", "--anyway", "--offsets", "active")
     words += ("--backlash", "controller")
     code, cold, note = run_orthocal(folder, *words)
@@ -400,16 +404,18 @@ def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, cali
         assert code == 0
         assert any(f"controller {part}" in c.lower() for c in head(text))
 
-    def last(text):
-        line = text.strip().splitlines()[-1]
-        return np.array([float(re.search(rf"{k}(-?[\d.]+)", line)[1]) for k in "XYZ"]) * 1e-3
+    def commanded(text):
+        """Ends of the motions of the program, shape (4, 3), [m]."""
+        written = read_polyline(text.splitlines())
+        return np.array([written[n][-1][0] for n in range(1, 5)]) * 1e-3
 
-    point = np.array([0.01, -0.02, 0.005])
+    # a common shift and rotation does not change distances
     for text, use in ((cold, UseConditions()), (warm, UseConditions(None, 34.0, 4.0))):
-        drives = nominal_closure(calibration.robot).inverse(last(text)) - calibration.active_offsets
+        drives = nominal_closure(calibration.robot).inverse(commanded(text))
+        drives = drives - calibration.active_offsets
         reached = calibration.machine.forward(drives, conditions=use)
-        assert np.abs(reached - point).max() < 1e-6
-    assert np.abs(last(cold) - last(warm)).max() > 5e-6
+        assert pdist(reached) == pytest.approx(pdist(points * 1e-3), abs=1e-6)
+    assert np.abs(commanded(cold) - commanded(warm)).max() > 5e-6
 
 
 @pytest.mark.parametrize(

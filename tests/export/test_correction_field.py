@@ -14,11 +14,13 @@ from commands import run_orthocal
 from programs import distances, read_polyline
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import entered_offsets, offsets_to_enter
 from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.workspace import box_workspace, cube
 
 WITHIN = 1e-6
 
@@ -49,6 +51,37 @@ def test_error_of_the_field_is_within_its_estimate(real, field):
     off = np.linalg.norm(reached - points, axis=1).max()
     assert off < 1.05 * field.error < 0.1 * WITHIN  # commanded and reached differ by a percent
     assert np.abs(sent - points).max() > 100e-6
+
+
+@pytest.mark.parametrize("tool", [(0.0, 0.0, 0.0), (0.02, -0.005, -0.08)])
+def test_aligned_corrections_keep_the_work_zero_and_the_form_of_the_part(real, tool):
+    """The corrected tool is moved by the best-fit rigid motion of the uncorrected machine.
+
+    The motion by the closed form of Kabsch, tips by Pinocchio.
+    """
+    workspace = cube(real.robot)
+    field = CorrectionField(real, OFFSETS, within=WITHIN, tool=tool, aligned_over=workspace)
+    points, weights, nominal = workspace.points, workspace.weights, nominal_closure(real.robot)
+
+    def move(commanded):
+        return tips(real.robot, real.errors, nominal.inverse(commanded) - OFFSETS, np.array(tool))
+
+    targets, jogged = points + tool, move(points)
+    middles = [weights @ p for p in (targets, jogged)]
+    u, _, vt = np.linalg.svd((weights[:, None] * (jogged - middles[1])).T @ (targets - middles[0]))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    corrected, refused = field(points)
+    assert not refused
+    expected = (targets - middles[0]) @ rotation.T + middles[1]
+    off = np.linalg.norm(move(corrected) - expected, axis=1).max()
+    assert off < 1.05 * field.error < 0.1 * WITHIN
+    shift, turn = middles[1] - middles[0], rotation - np.eye(3)
+    assert np.linalg.norm(shift) > 50e-6
+    assert np.abs(turn).max() > 1e-4
+    # motions with and without correction differ by the tool error of an aligned workpiece
+    difference = np.sqrt(weights @ ((corrected - points) ** 2).sum(axis=1))
+    aligned = np.sqrt(weights @ ((jogged - expected) ** 2).sum(axis=1))
+    assert difference == pytest.approx(aligned, rel=0.02)
 
 
 def test_line_that_leaves_the_workspace_is_refused_at_the_first_point(field):
@@ -215,13 +248,13 @@ PROGRAM = "G21 G0 X1 Y2 Z3\r\nG1 X5 F100 (\xe9)\r\n"
 
 
 def test_command_line(command, tmp_path):
-    """Offsets alone need a correction until they are entered; then what rounding leaves."""
+    """Offsets alone need a correction until they are entered; then rounding alone remains."""
     machine = command.calibration
-    nominal = nominal_closure(machine.robot)
+    workspace = box_workspace(machine.robot, assessment_of(machine).tool.box)
 
     def expected(point, offsets):
-        drives = machine.machine.inverse(np.array(point) * 1e-3) + offsets
-        return nominal.forward(drives) * 1e3
+        field = CorrectionField(machine, offsets, within=WITHIN, aligned_over=workspace)
+        return field.exactly(np.array([point]) * 1e-3)[0][0] * 1e3
 
     code, out, err = command(PROGRAM)
     assert code == 0
@@ -230,14 +263,16 @@ def test_command_line(command, tmp_path):
     found = re.fullmatch(r"G21 G0 X(\S+) Y(\S+) Z(\S+)", first)
     rounded = expected([1.0, 2.0, 3.0], offsets_to_enter(machine))
     assert [float(v) for v in found.groups()] == pytest.approx(rounded, abs=1e-4)
-    assert np.abs(rounded - [1.0, 2.0, 3.0]).max() > 2e-4  # more than the tolerance
+    assert "Largest correction: 0.000 mm." in err
     assert "For a controller with the offsets to enter: x_slide -0.5" in err
     assert "The program's coordinates are read as machine coordinates." in err
     code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
     assert code == 0
     assert "active during the measurement: x_slide +0.000 mm" in err
     got = read_polyline(out.splitlines())[0][0][0] + [10.0, 0.0, -5.0]
-    assert got == pytest.approx(expected([11.0, 2.0, -2.0], np.zeros(3)), abs=1e-4)
+    corrected = expected([11.0, 2.0, -2.0], np.zeros(3))
+    assert got == pytest.approx(corrected, abs=1e-4)
+    assert np.abs(corrected - [11.0, 2.0, -2.0]).max() > 0.01
     assert np.abs(entered_offsets(machine)).max() > 1e-4
     code, _, err = command(PROGRAM, "--out", str(tmp_path / "o.ngc"), "--tool=-3,0,-50.5")
     assert "For a tip at -3, 0, -50.5 mm from the tool centre point." in err
