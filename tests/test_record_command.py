@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 import pty
 import re
@@ -24,8 +25,9 @@ from orthocal.calibration.assessment_record import Place
 from orthocal.cli import recording
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.measurement.files.session_file import load_plan
-from orthocal.measurement.motion.motion import guide
+from orthocal.measurement.motion.motion import guide, plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
+from orthocal.output.sheet.page import sheet_files
 from orthocal.robot.loading import packaged_robots
 from orthocal.units import MM
 
@@ -161,6 +163,22 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
         f"Continue with: orthocal record {folder}",
     ):
         assert words in text
+
+
+def test_a_setup_names_the_motions_with_the_plunger_up_as_the_sheet_does(folder, run):
+    plan = PLAN.replace("x_max: {tcp_mm: [60, 0, 0]}", "aside: {tcp_mm: [0, 12, 0]}")
+    (folder / "session.yaml").write_text(plan)
+    (motion, other) = plan_motion(load_plan(folder))
+    assert [bool(s.lift) for s in motion.stops] == [False, True, True, False]
+    assert not other.lifting
+    sheet = html.unescape(sheet_files(load_plan(folder))["sheet.html"])
+    out = [" ".join(text.split()) for text in run(folder, *"0000").stdout.split("Setup ")]
+    hint = "Hold the plunger up on the way to line 3, line 4"
+    assert [text.count(hint) for text in (sheet, *out)] == [1, 0, 1, 0]
+    assert motion.lifting in sheet
+    assert motion.lifting in out[1]
+    out = " ".join(run(folder, "back 2").stdout.split())  # the setup is read already
+    assert hint not in out
 
 
 def test_each_setup_names_its_gauge_if_there_are_several(folder, run):

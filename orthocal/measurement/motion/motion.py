@@ -136,6 +136,11 @@ class Stop:
     """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
     do not command the tool."""
 
+    @property
+    def label(self) -> str:
+        """Line of readings.csv, or the posture of a stop without a reading."""
+        return self.posture if self.line is None else f"line {self.line}"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupMotion:
@@ -150,6 +155,15 @@ class SetupMotion:
     """Stop in the alignment posture; None if that is the first posture of `stops`."""
     stops: tuple[Stop, ...]
     """Stops in the postures to read, and in the first of them again."""
+
+    @property
+    def lifting(self) -> str:
+        """Instruction for the motions during which the plunger is held up; empty without them."""
+        lifted = [s for s in self.stops if s.lift]
+        if not lifted:
+            return ""
+        places = ", ".join(dict.fromkeys(s.label for s in lifted))
+        return f"Hold the plunger up on the way to {places}: {lifted[0].lift} there."
 
     def closing(self, stop: Stop, sensor: Sensor) -> str:
         """Instruction for a stop that repeats the first posture; empty for other stops."""

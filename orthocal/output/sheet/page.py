@@ -365,13 +365,11 @@ def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> st
         if beyond:
             texts.append(
                 "Even a perfect machine shows "
-                f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {_name(beyond[0])}, "
+                f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {beyond[0].label}, "
                 "beyond the range of the dial. Choose another posture or another dial."
             )
-    lifted = [s for s in motion.stops if s.lift]
-    if lifted:
-        places = ", ".join(dict.fromkeys(_name(s) for s in lifted))
-        texts.append(f"Lift the plunger on the way to {places}: {lifted[0].lift} there.")
+    if motion.lifting:
+        texts.append(motion.lifting)
     return "".join(paragraph(text, kind="warn") for text in texts)
 
 
@@ -437,10 +435,6 @@ def _posture(stop: Stop) -> str:
     if stop.cycle == 1 or stop.role == "subtracted":
         return stop.posture
     return f"{stop.posture}, cycle {stop.cycle}"
-
-
-def _name(stop: Stop) -> str:
-    return stop.posture if stop.line is None else f"line {stop.line}"
 
 
 def _afterwards(session: Session, command: str) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
+from orthocal.errors import OrthocalError
 from orthocal.measurement.motion.approach import (
     approach_length,
     common_approach,
@@ -22,7 +23,7 @@ from orthocal.measurement.motion.approach import (
     fill_approach,
     label_reading,
 )
-from orthocal.measurement.motion.motion import guide, set_dial
+from orthocal.measurement.motion.motion import guide, plan_motion, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
@@ -30,7 +31,7 @@ from orthocal.output.text.answer import calibrate_command
 from orthocal.robot.model import drive_keys
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
-from orthocal.session.points import base_name
+from orthocal.session.points import base_name, one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, spans
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
@@ -248,6 +249,8 @@ class RecordingText:
                 f"Go to {aligned} and align the {gauge}. {go}{set_dial(session, name)} From then "
                 f"on do not touch the {gauge_or_stand} until the setup is complete."
             )
+        if any(not r.is_read for r in of_setup):
+            parts.append(self._lifting(of_setup))
         if all(map(session.is_difference, of_setup)):
             parts.append(
                 "Each line is a difference: the reading in its first posture minus that in its "
@@ -257,6 +260,19 @@ class RecordingText:
         if aligned != first and not isinstance(setup.sensor, Points):
             lines.append(self._coordinates(aligned, f"{aligned}: "))
         return "\n".join(lines)
+
+    def _lifting(self, readings: Sequence[Reading]) -> str:
+        """Motions of a setup during which the plunger is held up, as the sheet names them.
+
+        Args:
+            readings: The readings of the setup.
+        """
+        session = replace(self._session, readings=tuple(readings), sha256="")
+        try:
+            (motion,) = plan_motion(one_row_per_point(session))
+        except OrthocalError:  # the machine cannot go through the plan, so there is no sheet
+            return ""
+        return motion.lifting
 
     def _stand(self, setup: str) -> str:
         steps = mounting_steps(self._session.setups[setup].sensor)
