@@ -893,6 +893,32 @@ def test_points_are_recorded_and_compared_with_their_prediction(tmp_path, run):
     assert np.array(recorded) == pytest.approx(np.vstack([points[:-1], slip]), abs=5e-4)
 
 
+def test_points_with_their_own_covariance_belong_to_one_setup(tmp_path, run):
+    """The instrument is placed once, and the lines are asked for in their order."""
+    places = [[0, 0, 0], [-50, 0, 0], [0, 40, 0], [0, 0, -30]]
+    postures = "".join(f"  p{i}: {{tcp_mm: {at}}}\n" for i, at in enumerate(places))
+    tracker = TRACKER.replace("gauge: {", "gauges: {tracker: {").replace("01}", "01}, dial: {}}")
+    (tmp_path / "session.yaml").write_text(
+        f"{tracker}{postures}setups:\n  track: {{sensor: points, gauge: tracker}}\n"
+        "  yx: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial}\n"
+        "readings: readings.csv\n"
+    )
+    covariances = ["90,60,400,0,0,0", "", "90,60,400,40,0,0", "90,60,400,0,0,0"]
+    rows = [f"track,p{i},,,,,{c or ',,,,,'}" for i, c in enumerate(covariances)]
+    rows.insert(2, "yx,p1" + "," * 10)
+    header = "setup,posture,x_mm,y_mm,z_mm,reading_mm,cov_xx_um2,cov_yy_um2,cov_zz_um2,cov_xy_um2"
+    header += ",cov_xz_um2,cov_yz_um2"
+    (tmp_path / "readings.csv").write_text("\n".join([header, *rows]) + "\n")
+    code, out, _ = run(tmp_path, *["1 2 3"] * 4, "repeat 2", "", "repeat 3", "4 5 6")
+    assert code == 0
+    assert re.findall(r"Setup (\w+, . of 2: . reading)", out) == [
+        *("track, 1 of 2: 4 reading", "yx, 2 of 2: 1 reading", "track, 1 of 2: 5 reading"),
+    ]
+    assert "Instrument 'tracker'\n" in out
+    assert re.findall(r"^Line (\d+): track", out, re.M)[:5] == ["2", "3", "5", "6", "7"]
+    assert [row["cycle"] for row in rows_of(tmp_path)[-2:]] == ["2", "2"]
+
+
 def test_interrupted_recording_of_points_continues(tmp_path, run):
     """One point does not determine the instrument's frame, yet the session opens."""
     postures = "".join(f"  p{i}: {{tcp_mm: [{i}, 0, {i}]}}\n" for i in range(3))

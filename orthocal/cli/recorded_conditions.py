@@ -54,14 +54,16 @@ class RecordedConditions:
             return None
         if "approach" in self._needed and row.approach is None and self.approach is None:
             return "approach"
-        if "temperature" in self._needed and row.setup not in self._asked:
-            self._continue(row.setup)
+        if "temperature" in self._needed and row.setup_in_file not in self._asked:
+            self._continue(row.setup_in_file)
             return "temperature"
         return None
 
     def _continue(self, setup: str) -> None:
         """Propose the last temperature of a setup that was read in part."""
-        stated = [r.conditions for r in self._recording.rows if r.setup == setup and r.is_read]
+        stated = [
+            r.conditions for r in self._recording.rows if r.setup_in_file == setup and r.is_read
+        ]
         temperatures = [c.temperature for c in stated if c and c.temperature is not None]
         if self.temperature is None and temperatures:
             self.temperature = temperatures[-1]
@@ -85,7 +87,7 @@ class RecordedConditions:
         if text:
             self._set_temperature(text)
         if row is not None:
-            self._asked.add(row.setup)
+            self._asked.add(row.setup_in_file)
 
     def end_correction(self) -> None:
         """Restore the conditions of the following readings after an existing one."""
@@ -122,7 +124,9 @@ class RecordedConditions:
         read = [r for r in self._recording.rows if r.is_read and r is not row and not r.minus]
         times = [r.conditions.time if r.conditions else None for r in read]
         if not self.clock or any(
-            t is None for r, t in zip(read, times, strict=True) if r.setup == row.setup
+            t is None
+            for r, t in zip(read, times, strict=True)
+            if r.setup_in_file == row.setup_in_file
         ):
             return None
         now = datetime.now().astimezone().replace(microsecond=0)

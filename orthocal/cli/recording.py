@@ -95,9 +95,9 @@ class Dialogue:
         if index is None:
             self._say("", self._text.state(self._warnings))
             return
-        setup = self._recording.rows[index].setup
+        setup = self._recording.rows[index].setup_in_file
         if setup != self._shown:
-            self._say("", self._text.setup(setup))
+            self._say("", self._text.setup(index))
             self._shown = setup
         self._say("", self._text.row(index))
         if self._question is not None:
@@ -122,8 +122,8 @@ class Dialogue:
         """True for a row after whose setup this program recorded another setup."""
         if self._last is None:
             return False
-        last, row = (self._text.name(self._recording.rows[i]) for i in (self._last, index))
-        return last != row
+        rows = self._recording.rows
+        return rows[self._last].setup_in_file != rows[index].setup_in_file
 
     def _conditions_of(self, index: int) -> Conditions:
         """Conditions to record with a reading that is typed now; those that are None do not change.
@@ -153,7 +153,7 @@ class Dialogue:
         if self._asked is not None:
             row = self._recording.rows[self._asked]
             point = " x y z" * (len(self._recording.point(self._asked)) > 1)
-            prompt = printable(f"{self._text.name(row)} {row.posture}{point} [mm]> ")
+            prompt = printable(f"{row.setup_in_file} {row.posture}{point} [mm]> ")
             if len(prompt) > self._text.width // 2:
                 prompt = f"line {row.line} [mm]> "
             prompt = {None: prompt, "temperature": "temperature [°C]> "}.get(
@@ -252,7 +252,9 @@ class Dialogue:
         self._last = index
         self._say(self._text.confirmation(index))
         following = self._next
-        is_end_of_setup = following is None or recording.rows[following].setup != row.setup
+        is_end_of_setup = (
+            following is None or recording.rows[following].setup_in_file != row.setup_in_file
+        )
         warned = False
         if self._is_doubtful(index) or is_end_of_setup or corrected:
             warned = self._judge(last=index)
@@ -527,9 +529,9 @@ class Dialogue:
         if index is None:
             raise SessionError("no line is asked for; `restart 7` reads the setup of line 7 again")
         recording = self._recording
-        setup = self._text.name(recording.rows[index])
+        setup = recording.rows[index].setup_in_file
         recording.empty(index)
-        indices = [i for i, r in enumerate(recording.rows) if self._text.name(r) == setup]
+        indices = [i for i, r in enumerate(recording.rows) if r.setup_in_file == setup]
         self._skipped -= {recording.rows[i].key for i in indices}
         self._shown, self._last = None, None
         self._note(f"Deleted: all readings of {setup}")

@@ -106,6 +106,11 @@ class RecordedReading(Reading):
     has_typed_approach: bool = False
 
     @property
+    def setup_in_file(self) -> str:
+        """Name of the setup in the files; the three setups of a point have one name there."""
+        return base_name(self.setup)
+
+    @property
     def planned_approach(self) -> str | None:
         """Approach that the plan states; None if it states none."""
         return None if self.has_typed_approach else self.approach
@@ -155,7 +160,7 @@ def change_rows(rows: Sequence[RecordedReading], change: Change) -> tuple[Record
             changed[index] = rows[index].with_reading(value * MM, change.conditions)
     elif change.done == "emptied":
         setup = base_name(keys[0][0])
-        changed = [r.emptied if base_name(r.setup) == setup else r for r in changed]
+        changed = [r.emptied if r.setup_in_file == setup else r for r in changed]
     elif change.done == "dropped":
         changed = [row for i, row in enumerate(changed) if i not in selected]
     else:
@@ -282,9 +287,9 @@ class Recording:
 
         All rows of a setup precede those of the next setup, added rows included.
         """
-        setups = list(dict.fromkeys(row.setup for row in self.rows))
+        setups = list(dict.fromkeys(row.setup_in_file for row in self.rows))
         empty = [i for i in self.missing if self.rows[i].key not in skipped]
-        return min(empty, key=lambda i: (setups.index(self.rows[i].setup), i), default=None)
+        return min(empty, key=lambda i: (setups.index(self.rows[i].setup_in_file), i), default=None)
 
     def value(self, index: int) -> float | Array:
         """Reading of a row, [m], or coordinates of its point in its station, shape (3,), [m]."""
@@ -351,7 +356,7 @@ class Recording:
         row = self.rows[index]
         if len(self.rows) >= MOST_READINGS:
             raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
-        same_setup = [r for r in self.rows if r.setup == row.setup]
+        same_setup = [r for r in self.rows if r.setup_in_file == row.setup_in_file]
         difference = self.session.is_difference(row)
         cycle = 1 + max(r.cycle for r in same_setup if difference or _has_same_cycles(row, r))
         in_cycle = [r for r in same_setup if r.cycle == cycle]

@@ -24,7 +24,7 @@ from orthocal.measurement.motion.approach import (
     label_reading,
 )
 from orthocal.measurement.motion.motion import guide, plan_motion, set_dial
-from orthocal.measurement.recording import Recording
+from orthocal.measurement.recording import RecordedReading, Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
@@ -165,7 +165,7 @@ class RecordingText:
         restored = recording.restored
         every, done = recording.count, recording.count - recording.missing_count
         title = f"{session.title}: " if session.title else ""
-        count = counted(len({base_name(r.setup) for r in rows}), "setup")
+        count = counted(len({r.setup_in_file for r in rows}), "setup")
         state = "none is recorded yet" if not done else f"{done} are recorded"
         parts = [f"{title}{counted(every, 'reading')} in {count} on {session.robot.name}; {state}."]
         if restored:
@@ -213,7 +213,7 @@ class RecordingText:
         Empty if the setup has no gauge that stays in its place.
         """
         row = self._recording.rows[index]
-        setup, name = self._session.setups[row.setup], self.name(row)
+        setup, name = self._session.setups[row.setup], row.setup_in_file
         if reads_pairs(setup.sensor):
             return ""
         return (
@@ -222,16 +222,21 @@ class RecordingText:
             "again."
         )
 
-    def setup(self, name: str) -> str:
-        """Position of the gauge of a setup, and preparation of its dial."""
+    def setup(self, index: int) -> str:
+        """Position of the gauge of a row's setup, and preparation of its dial."""
         session, rows = self._session, self._recording.rows
+        name, in_file = rows[index].setup, rows[index].setup_in_file
         setup = session.setups[name]
-        names = list(dict.fromkeys(base_name(r.setup) for r in rows))
-        of_setup = [r for r in rows if r.setup == name]
+        names = list(dict.fromkeys(r.setup_in_file for r in rows))
+        of_setup = [
+            r
+            for i, r in enumerate(rows)
+            if r.setup_in_file == in_file and self._recording.point(i)[0] == i
+        ]
         aligned, first = self._guidance.aligned_at[name], of_setup[0].minus or of_setup[0].posture
         go = "" if aligned == first else f"Then go to {first}. "
         title = (
-            f"Setup {self.name(of_setup[0])}, {names.index(base_name(name)) + 1} of {len(names)}: "
+            f"Setup {in_file}, {names.index(in_file) + 1} of {len(names)}: "
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
@@ -293,14 +298,9 @@ class RecordingText:
             "with the opposite sign."
         )
 
-    def label(self, row: Reading) -> str:
+    def label(self, row: RecordedReading) -> str:
         """Setup, posture with the arrows of its approach, and the cycle from the second on."""
-        return label_reading(self._session.robot, replace(row, setup=self.name(row)))
-
-    def name(self, row: Reading) -> str:
-        """Name of the setup of a row, as in the files."""
-        point = isinstance(self._session.setups[row.setup].sensor, Points)
-        return base_name(row.setup) if point else row.setup
+        return label_reading(self._session.robot, replace(row, setup=row.setup_in_file))
 
     def value(self, index: int) -> str:
         """Reading of a row, or the coordinates of its point, in mm."""
@@ -362,7 +362,7 @@ class RecordingText:
             text = f"No prediction: all other readings of this setup have a warning ({where})."
             return self.wrap(text, indent="  ")
         of = ""
-        if self.name(row) != row.setup:  # a coordinate of a point
+        if row.setup_in_file != row.setup:  # a coordinate of a point
             of = f" {row.setup.partition('[')[2].rstrip(']')}"
         text = f"The other readings predict{of} {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
         lines = [self.wrap(text, indent="  ")]
@@ -471,9 +471,11 @@ class RecordingText:
         command = printable(shlex.quote(path))
         if recording.missing:
             parts = []
-            for setup in dict.fromkeys(self.name(rows[i]) for i in recording.missing):
-                numbers = [rows[i].line for i in recording.missing if self.name(rows[i]) == setup]
-                every = len(numbers) == sum(self.name(r) == setup for r in rows)
+            for setup in dict.fromkeys(rows[i].setup_in_file for i in recording.missing):
+                numbers = [
+                    rows[i].line for i in recording.missing if rows[i].setup_in_file == setup
+                ]
+                every = len(numbers) == sum(r.setup_in_file == setup for r in rows)
                 which = spans(sorted({line or 0 for line in numbers}), "line")
                 parts.append(f"{setup} {'all' if every else which}")
             count = recording.missing_count
@@ -525,7 +527,7 @@ def _gauge(session: Session, setup: Setup) -> str:
         facts.append(f"{gauge.range[0] / MM:g} to {gauge.range[1] / MM:g} mm")
     if gauge.resolution is not None:
         facts.append(f"resolution {gauge.resolution / MM:g} mm")
-    name = session.distinguish_gauge(setup.gauge)
+    name = base_name(session.distinguish_gauge(setup.gauge))
     if not facts and not name:
         return ""
     noun = instrument(setup.sensor).capitalize()
