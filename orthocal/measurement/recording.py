@@ -43,6 +43,7 @@ from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.points import Coordinate
 from orthocal.sensors.protocol import largest_reading
+from orthocal.session.order import order_of_measurement
 from orthocal.session.points import base_name, gather_points
 from orthocal.session.session import (
     Conditions,
@@ -285,11 +286,11 @@ class Recording:
     def next_empty(self, skipped: frozenset[ReadingKey] = frozenset()) -> int | None:
         """Index of the next row without a reading, except those that are skipped.
 
-        All rows of a setup precede those of the next setup, added rows included.
+        Added rows are read with their setup, before its closing reading.
         """
-        setups = list(dict.fromkeys(row.setup_in_file for row in self.rows))
-        empty = [i for i in self.missing if self.rows[i].key not in skipped]
-        return min(empty, key=lambda i: (setups.index(self.rows[i].setup_in_file), i), default=None)
+        empty = {i for i in self.missing if self.rows[i].key not in skipped}
+        order = order_of_measurement([row.emptied for row in self.rows])
+        return next((i for i in order if i in empty), None)
 
     def value(self, index: int) -> float | Array:
         """Reading of a row, [m], or coordinates of its point in its station, shape (3,), [m]."""

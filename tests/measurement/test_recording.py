@@ -20,6 +20,7 @@ from orthocal.io.tables.numerals import parse_typed_reading
 from orthocal.measurement import recording as module
 from orthocal.measurement.files import session_file
 from orthocal.measurement.files.session_file import load_plan
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
@@ -174,6 +175,28 @@ def test_added_rows_are_asked_for_with_their_setup(plan):
         assert r.next_empty() == added == of_setup[-1]
         before = [row.line for row in r.rows]
     assert [row.line for row in load_plan(plan).readings] == before
+
+
+def test_the_closing_reading_follows_added_rows_in_record_and_on_the_sheet(plan):
+    """Rows that are added to the file, repeated, or deleted and added again."""
+    rows = ["yx,zero,1,", "yx,x_max,1,", "yx,x_min,1,", "yx,zero,2,", "yx,x_max,2,"]
+    rows += ["zx,zero,1,", "zx,x_max,1,", "zx,x_min,1,", "zx,zero,2,"]
+    (plan / "readings.csv").write_text("\n".join(["setup,posture,cycle,reading_mm", *rows, ""]))
+    with (plan / "session.yaml").open("a") as stream:
+        stream.write("readings: readings.csv\n")
+    asked = []
+    with open_recording(plan) as r:
+        dropped = r.rows[7]
+        r.drop(7)  # line 9
+        r.restore([dropped])  # line 11
+        r.repeat(1)  # line 3 again: line 12
+        while (i := r.next_empty()) is not None:
+            asked.append(r.rows[i].line)
+            r.read(i, 0.0)
+    assert asked == [2, 3, 4, 6, 12, 5, 7, 8, 11, 10]
+    motions = plan_motion(load_plan(plan))
+    assert [s.line for m in motions for s in m.stops] == asked
+    assert {s.role for m in motions for s in m.stops} == {"reading"}
 
 
 def test_a_repeated_difference_gets_a_cycle_that_holds_no_readings_of_another_form(plan):

@@ -40,6 +40,7 @@ from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import Contact, Sensor, ToolPath, has_dial, instrument, tool_path
+from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
 
@@ -187,7 +188,7 @@ class _Path(NamedTuple):
 
 
 def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
-    """Plan the path through every setup, in the order of the rows.
+    """Plan the path through every setup, in the order of measurement.
 
     Raises:
         SessionError: If there are too many readings, or a posture cannot be reached or approached.
@@ -198,7 +199,8 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
             where=str(session.path or "session"),
         )
     rows_by_setup: dict[str, list[tuple[int, Reading]]] = {}
-    for i, reading in enumerate(session.readings):
+    for i in order_of_measurement(session.readings):
+        reading = session.readings[i]
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
@@ -430,10 +432,10 @@ def _list_stops(
     *,
     any_side: bool = False,
 ) -> list[Stop]:
-    """Alignment of the gauge, stops in the order of the rows, and the first posture again.
+    """Alignment of the gauge, stops in the order of measurement, and the first posture again.
 
     Args:
-        rows: Lines and readings of the setup.
+        rows: Lines and readings of the setup in this order.
         aligned_at: Alignment posture.
         stop_at: Stops by posture and stated approach.
         any_side: Whether the first posture may be reached again from any side.

@@ -212,7 +212,7 @@ def _programs(options: ProgramOptions | None, *, with_bar: bool) -> str:
     if options.automatic:
         stops = (
             "stop (M0) where you mount the gauge, set its dial or hold its plunger. A logger reads "
-            "the gauge: its values are in the order of the lines"
+            "the gauge: its values are in the order of the tables"
         )
     return paragraph(
         f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "
@@ -442,7 +442,7 @@ def _afterwards(session: Session, command: str) -> str:
     columns = ["reading_mm"] * (not all(points)) + ["x_mm, y_mm and z_mm"] * any(points)
     steps = [
         "Enter the readings with `orthocal record`, which checks each one at once. Or type them "
-        f"into readings.csv, column {' or '.join(columns)}, in the order of its lines. Delete the "
+        f"into readings.csv, column {' or '.join(columns)}, each into its line. Delete the "
         "line of a reading that you could not take. `orthocal import` reads a spreadsheet.",
         "Run:",
     ]
