@@ -280,8 +280,8 @@ ENTRIES = {
     ),
     "back to a row that was dropped twice": (
         ["drop 3", "back 3", "drop", "back 3", "0.1"],
-        ["0.10", "", "", "", ""],
-        "Not recorded: line 3 was deleted; `back 8` adds it again, as the last line.",
+        ["", "", "", "", "", "0.10"],
+        "Added: line 8, yx x_max.",
     ),
     "repeat of a line with the number of a dropped row": (
         ["drop 7", "0.1", "repeat 2", "repeat 7"],
@@ -696,7 +696,7 @@ def test_planned_approach_and_temperature_are_recorded(folder, run):
     assert [r["temperature_C"] for r in rows] == ["21.5", "21.5", "22.5", "22.5", "22.5"]
     assert "time" not in rows[0]  # lines of a pipe have no time
     journal = (folder / f"readings.csv{SUFFIX}").read_text()
-    assert journal.count('"temperature_C": 22.5') == 3
+    assert journal.count('"temperature_C": 22.5') == 4  # as typed, and with three readings
     session = load_session(folder)
     assert [r.conditions.temperature for r in session.readings][:3] == [21.5, 21.5, 22.5]
 
@@ -718,6 +718,22 @@ def test_a_corrected_typing_error_keeps_its_temperature(folder, run):
     first, second, *_ = rows_of(folder)
     assert (first["reading_mm"], first["temperature_C"]) == ("0.11", "20")
     assert second["temperature_C"] == "20"
+
+
+def test_a_recording_that_continues_keeps_temperature_and_deleted_lines(folder, run):
+    run(folder, "0.1", "t 22", "drop 3")
+    code, out, _ = run(folder, "0.2", "back 3", "t 25", "0.3")
+    assert code == 0
+    assert "Noted with the next readings, as typed before: 22 °C. `t 20` changes it." in out
+    assert "Added: line 8, yx x_max." in out
+    rows = {row["posture"]: row for row in rows_of(folder) if row["setup"] == "yx"}
+    noted = {p: (row["reading_mm"], row["temperature_C"]) for p, row in rows.items()}
+    assert noted == {"zero": ("0.10", ""), "x_min": ("0.20", "22"), "x_max": ("0.30", "25")}
+    _, out, _ = run(folder, "back 2", "t 18", "", "0.4", "back 3")
+    assert "as typed before: 25 °C" in out
+    assert "Not recorded: line 3 is line 8 now." in out
+    assert [r["temperature_C"] for r in rows_of(folder)] == ["18", "22", "25", "", "", "25"]
+    assert "as typed before: 25 °C" in run(folder)[1]  # 18 °C was that of a corrected reading
 
 
 def test_setups_of_a_dial_have_no_brackets(folder, run):

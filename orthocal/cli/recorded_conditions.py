@@ -35,7 +35,7 @@ class RecordedConditions:
     """
 
     def __init__(self, recording: Recording, programmed: str) -> None:
-        self.temperature: float | None = None
+        self.temperature = recording.temperature
         self.is_unusual = False
         """Whether the temperature that was typed last may be a mistake."""
         self.approach: str | None = None
@@ -85,7 +85,9 @@ class RecordedConditions:
             self._set_approach(text or self.programmed)
             return
         if text:
-            self._set_temperature(text)
+            self.temperature = self._read_temperature(text)
+            if self._following is None:
+                self._recording.note_temperature(self.temperature)
         if row is not None:
             self._asked.add(row.setup_in_file)
 
@@ -94,12 +96,13 @@ class RecordedConditions:
         if self._following is not None:
             (self.approach, self.temperature), self._following = self._following, None
 
-    def _set_temperature(self, text: str) -> None:
-        """Set the temperature, [°C]; refuse one that no workshop has."""
-        number = plain_minus(text).replace(",", ".")
-        before, self.temperature = self.temperature, parse_temperature(number, "the temperature")
-        change = abs(self.temperature - before) if _is_usual(before) else 0.0
-        self.is_unusual = not _is_usual(self.temperature) or change > USUAL_CHANGE
+    def _read_temperature(self, text: str) -> float:
+        """Typed temperature, [°C]; refuse one that no workshop has."""
+        number, before = plain_minus(text).replace(",", "."), self.temperature
+        temperature = parse_temperature(number, "the temperature")
+        change = abs(temperature - before) if _is_usual(before) else 0.0
+        self.is_unusual = not _is_usual(temperature) or change > USUAL_CHANGE
+        return temperature
 
     def _set_approach(self, text: str) -> None:
         """Set the approach: one letter for each drive, or for all."""

@@ -19,7 +19,7 @@ from orthocal.errors import OrthocalError, SessionError
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.hypotheses.search import find_suspected_rows
 from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading
-from orthocal.measurement.recording import RecordedReading, Recording
+from orthocal.measurement.recording import Recording
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
 from orthocal.runtime.interrupts import raised_interrupt
 from orthocal.session.session import Conditions, ReadingKey
@@ -27,6 +27,10 @@ from orthocal.text import printable, shorten
 
 LONGEST_LINE = 10_000
 """Largest number of characters of a line that are read at once; a reading has ten."""
+
+
+LONGEST_NUMBER = 9
+"""Largest number of digits of a line's number."""
 
 
 class _EndOfDialogue(Exception):
@@ -54,10 +58,6 @@ class Dialogue:
         """Setup that was described last."""
         self._last: int | None = None
         """Index of the row that was read last."""
-        self._dropped: dict[str, list[RecordedReading]] = {}
-        """Deleted rows by their line."""
-        self._restored: dict[str, str] = {}
-        """Lines of deleted rows, mapped to their lines since they were added again."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
         self._stated: set[str] = set()
@@ -410,25 +410,29 @@ class Dialogue:
             SessionError: If there is no such line, or the command cannot be executed now.
         """
         lines = [str(row.line) for row in self._recording.rows]
-        if name == "back" and line in self._dropped and line not in lines:
-            self._restore(line)
+        number = int(line) if line.isdecimal() and len(line) < LONGEST_NUMBER else 0
+        if name == "back" and line not in lines and self._recording.is_deleted(number):
+            self._restore(number)
             return
         if line and line not in lines:
-            raise SessionError(self._describe_missing(line, lines))
+            raise SessionError(self._describe_missing(line, number, lines))
         commands = {
             **{"back": self._back, "repeat": self._repeat},
             **{"drop": self._drop, "restart": self._restart},
         }
         commands[name](lines.index(line) if line else None)
 
-    def _describe_missing(self, line: str, lines: Sequence[str]) -> str:
-        """Reason why there is no such line."""
-        now = line
-        while now in self._restored and now not in lines:
-            now = self._restored[now]
-        if now in self._dropped:
-            return f"line {line} was deleted; `back {now}` adds it again, as the last line"
-        if now != line:
+    def _describe_missing(self, line: str, number: int, lines: Sequence[str]) -> str:
+        """Reason why there is no such line.
+
+        Args:
+            line: The line as typed.
+            number: Its number; 0 if it is none.
+            lines: All lines.
+        """
+        if self._recording.is_deleted(number):
+            return f"line {line} was deleted; `back {line}` adds it again, as the last line"
+        if now := self._recording.present_line(number):
             return f"line {line} is line {now} now"
         return f"'{shorten(line)}' is not a line; expected {lines[0]} to {lines[-1]}"
 
@@ -500,10 +504,8 @@ class Dialogue:
 
     def _drop(self, index: int | None) -> None:
         index = self._require_row() if index is None else index
-        rows = [self._recording.rows[i] for i in self._recording.point(index)]
-        row, count = self._recording.rows[index], len(rows)
+        row, count = self._recording.rows[index], len(self._recording.point(index))
         stated = self._recording.drop(index)
-        self._dropped[str(row.line)] = rows
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - count
         self._note(
@@ -515,11 +517,9 @@ class Dialogue:
         self._judge()
         self._ask_for_next()
 
-    def _restore(self, line: str) -> None:
-        index = self._recording.restore(self._dropped[line])
-        del self._dropped[line]
+    def _restore(self, line: int) -> None:
+        index = self._recording.restore(line)
         row = self._recording.rows[index]
-        self._restored[line] = str(row.line)
         self._note(f"Added: line {row.line}, {self._text.label(row)}.")
         self._ask_for(index)
 

@@ -185,6 +185,11 @@ class RecordingText:
             f"{self._what_to_type()} It is stored at once. `help` lists the commands. "
             "Lines are those of the sheet and of readings.csv."
         )
+        if recording.temperature is not None:
+            parts.append(
+                f"Noted with the next readings, as typed before: {recording.temperature:g} °C. "
+                "`t 20` changes it."
+            )
         length = approach_length(session)
         parts.append(
             f"Approach each posture as its arrows show: in the last {length} the displayed number "
