@@ -288,9 +288,24 @@ ENTRIES = {
         ["0.10"],
         "Not recorded: line 7 was not read yet.",
     ),
-    "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
+    "restart": (
+        ["0.1", "0.2", "restart", "restart", "0.3"],
+        ["0.30"],
+        "`restart` deletes 2 readings of yx. Type it again to delete; any other line keeps them.",
+    ),
+    "restart that is not confirmed": (
+        ["0.1", "0.2", "restart", "list", "restart", "0.3", "restart 2"],
+        ["0.10", "0.20", "0.30"],
+        "`restart` deletes 3 readings of yx.",
+    ),
+    "restart of two setups": (
+        [*["0.1"] * 4, "restart", "restart 2", "restart"],
+        ["0.10"] * 4,
+        "`restart` deletes 3 readings of yx.",
+    ),
+    "restart without readings": (["restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
     "restart of an earlier setup": (
-        ["0.1", "0.2", "0.3", "0.4", "restart 3", "0.5"],
+        ["0.1", "0.2", "0.3", "0.4", "restart 3", "restart 3", "0.5"],
         ["0.50", "", "", "0.40"],
         "Deleted: all readings of yx Setup yx, 1 of 2",
     ),
@@ -810,7 +825,7 @@ def test_restart_deletes_typed_sides(folder, run):
     """The same command asks for the side again."""
     with_effects(folder, "backlash", TABLE + "yx,x_max,1,,\nyx,x_max,2,,\n")
     run(folder, "0.01", "0.02", "0.03", "n", "0.04")
-    run(folder, "restart 2")
+    run(folder, "restart 2", "restart 2")
     rows = rows_of(folder)
     assert [r["approach"] for r in rows] == ["ppp", "nnn", "ppp", "ppp", "nnn", "", ""]
     assert set(cells(folder)) == {""}

@@ -12,6 +12,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.judgement import find_warnings, is_doubtful, is_far, judge_session
+from orthocal.assessment.wording import counted
 from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
 from orthocal.cli.recorded_conditions import RecordedConditions
@@ -60,6 +61,8 @@ class Dialogue:
         """Index of the row that was read last."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
+        self._offered: str | None = None
+        """Setup whose readings the last line, a `restart`, offered to delete."""
         self._stated: set[str] = set()
         """Conditions that were typed while this row is asked for."""
 
@@ -182,6 +185,7 @@ class Dialogue:
     def _answer(self, line: str) -> None:
         """Execute a line; errors are printed, and the question is repeated."""
         word, *arguments = line.split() or [""]
+        offered = self._offered
         try:
             if self._question is not None and self._is_answer(word, arguments):
                 self._set_condition(self._question, word)
@@ -200,6 +204,8 @@ class Dialogue:
                     self._record(index, parse_typed_reading(line, largest=largest))
         except SessionError as e:
             self._note(f"Not recorded: {e}.")
+        if self._offered == offered:
+            self._offered = None
 
     def _is_answer(self, word: str, arguments: list[str]) -> bool:
         """True if a line is a single word that answers the question about a condition."""
@@ -530,8 +536,16 @@ class Dialogue:
             raise SessionError("no line is asked for; `restart 7` reads the setup of line 7 again")
         recording = self._recording
         setup = recording.rows[index].setup_in_file
-        recording.empty(index)
         indices = [i for i, r in enumerate(recording.rows) if r.setup_in_file == setup]
+        count = len({recording.rows[i].line for i in indices if recording.rows[i].is_read})
+        if count and self._offered != setup:
+            self._offered = setup
+            self._note(
+                f"`restart` deletes {counted(count, 'reading')} of {setup}. Type it again to "
+                "delete; any other line keeps them."
+            )
+            return
+        recording.empty(index)
         self._skipped -= {recording.rows[i].key for i in indices}
         self._shown, self._last = None, None
         self._note(f"Deleted: all readings of {setup}")

@@ -51,7 +51,7 @@ COMMANDS = {
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
-    "`restart 7` the setup of line 7",
+    "`restart 7` the setup of line 7; it is typed twice",
     "temperature": "temperature in °C of this reading and the next ones, such as `t 22.5`; after "
     "`back`, of the corrected reading only",
     "side": "approach of this reading and the next ones, unless the plan states it: `side n`; "
