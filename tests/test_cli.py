@@ -27,6 +27,7 @@ from orthocal import (
 )
 from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.cli.run import PANELS, make_program
+from orthocal.measurement.recording import open_recording
 
 pytestmark = pytest.mark.usefixtures("short_reports")
 
@@ -153,6 +154,7 @@ def test_again_writes_the_same_plan_with_active_offsets(calibrated, experiment, 
     out = tmp_path / "second"
     code, text, err = orthocal("again", calibrated, "--out", out)
     assert code == 0, err
+    assert "other numbers" not in err
     first, second = load_plan(experiment), load_plan(out)
     entered = offsets_to_enter(load_calibration(calibrated))
     assert second.active_offsets == pytest.approx(entered, abs=1e-12)
@@ -187,7 +189,9 @@ def test_sheet_and_programs_have_the_lines_of_the_new_table(calibrated, experime
     table.write_text("".join([head, *rows[:4], "\n", *rows[4:7], "\n", *rows[7:]]))
     out = tmp_path / "second"
     words = ("again", calibrated, "--session", tmp_path / "first", "--out", out)
-    assert orthocal(*words).returncode == 0
+    code, _, err = orthocal(*words)
+    note = "The new lines therefore have other numbers: measure with the new sheet only."
+    assert (code, note in " ".join(err.split())) == (0, True)
     rows = (out / "readings.csv").read_text().splitlines()
     programmed = {}
     for program in out.glob("*.ngc"):
@@ -199,6 +203,20 @@ def test_sheet_and_programs_have_the_lines_of_the_new_table(calibrated, experime
     sheet = (out / "sheet.html").read_text()
     printed = re.findall(r'<tr[^>]*><td class="number">(\d+)</td>', sheet)
     assert set(map(int, printed)) == set(expected)
+
+
+def test_rows_of_the_new_table_are_in_the_order_of_measurement(calibrated, experiment, tmp_path):
+    """A row that `record` added has the last line of the old table."""
+    shutil.copytree(experiment, tmp_path / "first")
+    with open_recording(tmp_path / "first") as recording:
+        recording.repeat(0)
+        setup = recording.rows[0].setup
+    out = tmp_path / "second"
+    words = ("again", calibrated, "--session", tmp_path / "first", "--out", out)
+    code, _, err = orthocal(*words)
+    assert (code, "other numbers" in err) == (0, True)
+    rows = [(r.setup, r.cycle) for r in load_plan(out).readings]
+    assert rows[:2] == [(setup, 1), (setup, 2)]
 
 
 def test_offsets_are_changes_if_no_session_states_the_active_ones(experiment, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 import pty
 import re
@@ -24,8 +25,9 @@ from orthocal.calibration.assessment_record import Place
 from orthocal.cli import recording
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.measurement.files.session_file import load_plan
-from orthocal.measurement.motion.motion import guide
+from orthocal.measurement.motion.motion import guide, plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
+from orthocal.output.sheet.page import sheet_files
 from orthocal.robot.loading import packaged_robots
 from orthocal.units import MM
 
@@ -163,6 +165,22 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
         assert words in text
 
 
+def test_a_setup_names_the_motions_with_the_plunger_up_as_the_sheet_does(folder, run):
+    plan = PLAN.replace("x_max: {tcp_mm: [60, 0, 0]}", "aside: {tcp_mm: [0, 12, 0]}")
+    (folder / "session.yaml").write_text(plan)
+    (motion, other) = plan_motion(load_plan(folder))
+    assert [bool(s.lift) for s in motion.stops] == [False, True, True, False]
+    assert not other.lifting
+    sheet = html.unescape(sheet_files(load_plan(folder))["sheet.html"])
+    out = [" ".join(text.split()) for text in run(folder, *"0000").stdout.split("Setup ")]
+    hint = "Hold the plunger up on the way to line 3, line 4"
+    assert [text.count(hint) for text in (sheet, *out)] == [1, 0, 1, 0]
+    assert motion.lifting in sheet
+    assert motion.lifting in out[1]
+    out = " ".join(run(folder, "back 2").stdout.split())  # the setup is read already
+    assert hint not in out
+
+
 def test_each_setup_names_its_gauge_if_there_are_several(folder, run):
     digital = "  digital: {sigma_mm: 0.001, tip: {ball: {radius_mm: 1.5}}}"
     text = PLAN.replace("gauge: {", "gauges:\n  dial: {")
@@ -262,17 +280,32 @@ ENTRIES = {
     ),
     "back to a row that was dropped twice": (
         ["drop 3", "back 3", "drop", "back 3", "0.1"],
-        ["0.10", "", "", "", ""],
-        "Not recorded: line 3 was deleted; `back 8` adds it again, as the last line.",
+        ["", "", "", "", "", "0.10"],
+        "Added: line 8, yx x_max.",
     ),
     "repeat of a line with the number of a dropped row": (
         ["drop 7", "0.1", "repeat 2", "repeat 7"],
         ["0.10"],
         "Not recorded: line 7 was not read yet.",
     ),
-    "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
+    "restart": (
+        ["0.1", "0.2", "restart", "restart", "0.3"],
+        ["0.30"],
+        "`restart` deletes 2 readings of yx. Type it again to delete; any other line keeps them.",
+    ),
+    "restart that is not confirmed": (
+        ["0.1", "0.2", "restart", "list", "restart", "0.3", "restart 2"],
+        ["0.10", "0.20", "0.30"],
+        "`restart` deletes 3 readings of yx.",
+    ),
+    "restart of two setups": (
+        [*["0.1"] * 4, "restart", "restart 2", "restart"],
+        ["0.10"] * 4,
+        "`restart` deletes 3 readings of yx.",
+    ),
+    "restart without readings": (["restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
     "restart of an earlier setup": (
-        ["0.1", "0.2", "0.3", "0.4", "restart 3", "0.5"],
+        ["0.1", "0.2", "0.3", "0.4", "restart 3", "restart 3", "0.5"],
         ["0.50", "", "", "0.40"],
         "Deleted: all readings of yx Setup yx, 1 of 2",
     ),
@@ -678,7 +711,7 @@ def test_planned_approach_and_temperature_are_recorded(folder, run):
     assert [r["temperature_C"] for r in rows] == ["21.5", "21.5", "22.5", "22.5", "22.5"]
     assert "time" not in rows[0]  # lines of a pipe have no time
     journal = (folder / f"readings.csv{SUFFIX}").read_text()
-    assert journal.count('"temperature_C": 22.5') == 3
+    assert journal.count('"temperature_C": 22.5') == 4  # as typed, and with three readings
     session = load_session(folder)
     assert [r.conditions.temperature for r in session.readings][:3] == [21.5, 21.5, 22.5]
 
@@ -700,6 +733,22 @@ def test_a_corrected_typing_error_keeps_its_temperature(folder, run):
     first, second, *_ = rows_of(folder)
     assert (first["reading_mm"], first["temperature_C"]) == ("0.11", "20")
     assert second["temperature_C"] == "20"
+
+
+def test_a_recording_that_continues_keeps_temperature_and_deleted_lines(folder, run):
+    run(folder, "0.1", "t 22", "drop 3")
+    code, out, _ = run(folder, "0.2", "back 3", "t 25", "0.3")
+    assert code == 0
+    assert "Noted with the next readings, as typed before: 22 °C. `t 20` changes it." in out
+    assert "Added: line 8, yx x_max." in out
+    rows = {row["posture"]: row for row in rows_of(folder) if row["setup"] == "yx"}
+    noted = {p: (row["reading_mm"], row["temperature_C"]) for p, row in rows.items()}
+    assert noted == {"zero": ("0.10", ""), "x_min": ("0.20", "22"), "x_max": ("0.30", "25")}
+    _, out, _ = run(folder, "back 2", "t 18", "", "0.4", "back 3")
+    assert "as typed before: 25 °C" in out
+    assert "Not recorded: line 3 is line 8 now." in out
+    assert [r["temperature_C"] for r in rows_of(folder)] == ["18", "22", "25", "", "", "25"]
+    assert "as typed before: 25 °C" in run(folder)[1]  # 18 °C was that of a corrected reading
 
 
 def test_setups_of_a_dial_have_no_brackets(folder, run):
@@ -776,7 +825,7 @@ def test_restart_deletes_typed_sides(folder, run):
     """The same command asks for the side again."""
     with_effects(folder, "backlash", TABLE + "yx,x_max,1,,\nyx,x_max,2,,\n")
     run(folder, "0.01", "0.02", "0.03", "n", "0.04")
-    run(folder, "restart 2")
+    run(folder, "restart 2", "restart 2")
     rows = rows_of(folder)
     assert [r["approach"] for r in rows] == ["ppp", "nnn", "ppp", "ppp", "nnn", "", ""]
     assert set(cells(folder)) == {""}
@@ -873,6 +922,32 @@ def test_points_are_recorded_and_compared_with_their_prediction(tmp_path, run):
     assert float(differs[1]) == pytest.approx(1.0, abs=0.1)
     recorded = [[float(row[f"{k}_mm"]) for k in "xyz"] for row in rows_of(tmp_path)]
     assert np.array(recorded) == pytest.approx(np.vstack([points[:-1], slip]), abs=5e-4)
+
+
+def test_points_with_their_own_covariance_belong_to_one_setup(tmp_path, run):
+    """The instrument is placed once, and the lines are asked for in their order."""
+    places = [[0, 0, 0], [-50, 0, 0], [0, 40, 0], [0, 0, -30]]
+    postures = "".join(f"  p{i}: {{tcp_mm: {at}}}\n" for i, at in enumerate(places))
+    tracker = TRACKER.replace("gauge: {", "gauges: {tracker: {").replace("01}", "01}, dial: {}}")
+    (tmp_path / "session.yaml").write_text(
+        f"{tracker}{postures}setups:\n  track: {{sensor: points, gauge: tracker}}\n"
+        "  yx: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial}\n"
+        "readings: readings.csv\n"
+    )
+    covariances = ["90,60,400,0,0,0", "", "90,60,400,40,0,0", "90,60,400,0,0,0"]
+    rows = [f"track,p{i},,,,,{c or ',,,,,'}" for i, c in enumerate(covariances)]
+    rows.insert(2, "yx,p1" + "," * 10)
+    header = "setup,posture,x_mm,y_mm,z_mm,reading_mm,cov_xx_um2,cov_yy_um2,cov_zz_um2,cov_xy_um2"
+    header += ",cov_xz_um2,cov_yz_um2"
+    (tmp_path / "readings.csv").write_text("\n".join([header, *rows]) + "\n")
+    code, out, _ = run(tmp_path, *["1 2 3"] * 4, "repeat 2", "", "repeat 3", "4 5 6")
+    assert code == 0
+    assert re.findall(r"Setup (\w+, . of 2: . reading)", out) == [
+        *("track, 1 of 2: 4 reading", "yx, 2 of 2: 1 reading", "track, 1 of 2: 5 reading"),
+    ]
+    assert "Instrument 'tracker'\n" in out
+    assert re.findall(r"^Line (\d+): track", out, re.M)[:5] == ["2", "3", "5", "6", "7"]
+    assert [row["cycle"] for row in rows_of(tmp_path)[-2:]] == ["2", "2"]
 
 
 def test_interrupted_recording_of_points_continues(tmp_path, run):

@@ -89,6 +89,7 @@ def again(
     entered = joints is not None and states_offsets(joints.offsets, new.active_offsets)
     put_out(_describe_entries(new, result, calibration, ini=ini if entered else None))
     _note_other_lines(result, new, ini, joints)
+    _note_numbers(new)
     note_beyond_limits(new, ini)
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
@@ -111,6 +112,18 @@ def _write(new: orthocal.Session, out: Path, validating: str) -> None:
     if problem:
         put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
+
+
+def _note_numbers(new: orthocal.Session) -> None:
+    """Note that the rows of a new session have other lines than in the session that it repeats."""
+    from orthocal.measurement.files.write_session import number_rows
+
+    numbered = number_rows(new).readings
+    if any(r.line != n.line for r, n in zip(new.readings, numbered, strict=True)):
+        put_note(
+            "Lines were deleted or added while the readings were taken. The new lines therefore "
+            "have other numbers: measure with the new sheet only."
+        )
 
 
 def _note_other_lines(
@@ -279,6 +292,8 @@ def _plan_again(
 ) -> orthocal.Session:
     """Plan of the rows of a session, with the offsets to enter as active offsets.
 
+    The rows are in the order of measurement.
+
     Args:
         calibration: The calibration.
         path: A session with these rows; None for the last session of the calibration.
@@ -287,6 +302,7 @@ def _plan_again(
     from orthocal.assessment.controller_entries import offsets_to_enter
     from orthocal.calibration.recorded_robot import require_calibrated_robot
     from orthocal.effects.adjustment import add_amounts
+    from orthocal.session.order import order_of_measurement
 
     parts = calibration.session.parts
     if path is None and parts:
@@ -309,4 +325,5 @@ def _plan_again(
         offsets_to_enter(orthocal.adjust_calibration(calibration, amounts))
     )
     adjusted = add_amounts(dict(calibration.session.adjusted), amounts)
-    return replace(planned, title=title, source="", seed=None, adjusted=adjusted)
+    readings = tuple(planned.readings[i] for i in order_of_measurement(planned.readings))
+    return replace(planned, readings=readings, title=title, source="", seed=None, adjusted=adjusted)

@@ -35,7 +35,7 @@ class RecordedConditions:
     """
 
     def __init__(self, recording: Recording, programmed: str) -> None:
-        self.temperature: float | None = None
+        self.temperature = recording.temperature
         self.is_unusual = False
         """Whether the temperature that was typed last may be a mistake."""
         self.approach: str | None = None
@@ -54,14 +54,16 @@ class RecordedConditions:
             return None
         if "approach" in self._needed and row.approach is None and self.approach is None:
             return "approach"
-        if "temperature" in self._needed and row.setup not in self._asked:
-            self._continue(row.setup)
+        if "temperature" in self._needed and row.setup_in_file not in self._asked:
+            self._continue(row.setup_in_file)
             return "temperature"
         return None
 
     def _continue(self, setup: str) -> None:
         """Propose the last temperature of a setup that was read in part."""
-        stated = [r.conditions for r in self._recording.rows if r.setup == setup and r.is_read]
+        stated = [
+            r.conditions for r in self._recording.rows if r.setup_in_file == setup and r.is_read
+        ]
         temperatures = [c.temperature for c in stated if c and c.temperature is not None]
         if self.temperature is None and temperatures:
             self.temperature = temperatures[-1]
@@ -83,21 +85,24 @@ class RecordedConditions:
             self._set_approach(text or self.programmed)
             return
         if text:
-            self._set_temperature(text)
+            self.temperature = self._read_temperature(text)
+            if self._following is None:
+                self._recording.note_temperature(self.temperature)
         if row is not None:
-            self._asked.add(row.setup)
+            self._asked.add(row.setup_in_file)
 
     def end_correction(self) -> None:
         """Restore the conditions of the following readings after an existing one."""
         if self._following is not None:
             (self.approach, self.temperature), self._following = self._following, None
 
-    def _set_temperature(self, text: str) -> None:
-        """Set the temperature, [°C]; refuse one that no workshop has."""
-        number = plain_minus(text).replace(",", ".")
-        before, self.temperature = self.temperature, parse_temperature(number, "the temperature")
-        change = abs(self.temperature - before) if _is_usual(before) else 0.0
-        self.is_unusual = not _is_usual(self.temperature) or change > USUAL_CHANGE
+    def _read_temperature(self, text: str) -> float:
+        """Typed temperature, [°C]; refuse one that no workshop has."""
+        number, before = plain_minus(text).replace(",", "."), self.temperature
+        temperature = parse_temperature(number, "the temperature")
+        change = abs(temperature - before) if _is_usual(before) else 0.0
+        self.is_unusual = not _is_usual(temperature) or change > USUAL_CHANGE
+        return temperature
 
     def _set_approach(self, text: str) -> None:
         """Set the approach: one letter for each drive, or for all."""
@@ -122,7 +127,9 @@ class RecordedConditions:
         read = [r for r in self._recording.rows if r.is_read and r is not row and not r.minus]
         times = [r.conditions.time if r.conditions else None for r in read]
         if not self.clock or any(
-            t is None for r, t in zip(read, times, strict=True) if r.setup == row.setup
+            t is None
+            for r, t in zip(read, times, strict=True)
+            if r.setup_in_file == row.setup_in_file
         ):
             return None
         now = datetime.now().astimezone().replace(microsecond=0)

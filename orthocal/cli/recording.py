@@ -12,6 +12,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.judgement import find_warnings, is_doubtful, is_far, judge_session
+from orthocal.assessment.wording import counted
 from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
 from orthocal.cli.recorded_conditions import RecordedConditions
@@ -19,7 +20,7 @@ from orthocal.errors import OrthocalError, SessionError
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.hypotheses.search import find_suspected_rows
 from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading
-from orthocal.measurement.recording import RecordedReading, Recording
+from orthocal.measurement.recording import Recording
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
 from orthocal.runtime.interrupts import raised_interrupt
 from orthocal.session.session import Conditions, ReadingKey
@@ -27,6 +28,10 @@ from orthocal.text import printable, shorten
 
 LONGEST_LINE = 10_000
 """Largest number of characters of a line that are read at once; a reading has ten."""
+
+
+LONGEST_NUMBER = 9
+"""Largest number of digits of a line's number."""
 
 
 class _EndOfDialogue(Exception):
@@ -54,12 +59,10 @@ class Dialogue:
         """Setup that was described last."""
         self._last: int | None = None
         """Index of the row that was read last."""
-        self._dropped: dict[str, list[RecordedReading]] = {}
-        """Deleted rows by their line."""
-        self._restored: dict[str, str] = {}
-        """Lines of deleted rows, mapped to their lines since they were added again."""
         self._asked: int | None = None
         """Index of the row that is asked for; None if all are read or skipped."""
+        self._offered: str | None = None
+        """Setup whose readings the last line, a `restart`, offered to delete."""
         self._stated: set[str] = set()
         """Conditions that were typed while this row is asked for."""
 
@@ -95,9 +98,9 @@ class Dialogue:
         if index is None:
             self._say("", self._text.state(self._warnings))
             return
-        setup = self._recording.rows[index].setup
+        setup = self._recording.rows[index].setup_in_file
         if setup != self._shown:
-            self._say("", self._text.setup(setup))
+            self._say("", self._text.setup(index))
             self._shown = setup
         self._say("", self._text.row(index))
         if self._question is not None:
@@ -122,8 +125,8 @@ class Dialogue:
         """True for a row after whose setup this program recorded another setup."""
         if self._last is None:
             return False
-        last, row = (self._text.name(self._recording.rows[i]) for i in (self._last, index))
-        return last != row
+        rows = self._recording.rows
+        return rows[self._last].setup_in_file != rows[index].setup_in_file
 
     def _conditions_of(self, index: int) -> Conditions:
         """Conditions to record with a reading that is typed now; those that are None do not change.
@@ -153,7 +156,7 @@ class Dialogue:
         if self._asked is not None:
             row = self._recording.rows[self._asked]
             point = " x y z" * (len(self._recording.point(self._asked)) > 1)
-            prompt = printable(f"{self._text.name(row)} {row.posture}{point} [mm]> ")
+            prompt = printable(f"{row.setup_in_file} {row.posture}{point} [mm]> ")
             if len(prompt) > self._text.width // 2:
                 prompt = f"line {row.line} [mm]> "
             prompt = {None: prompt, "temperature": "temperature [°C]> "}.get(
@@ -182,6 +185,7 @@ class Dialogue:
     def _answer(self, line: str) -> None:
         """Execute a line; errors are printed, and the question is repeated."""
         word, *arguments = line.split() or [""]
+        offered = self._offered
         try:
             if self._question is not None and self._is_answer(word, arguments):
                 self._set_condition(self._question, word)
@@ -200,6 +204,8 @@ class Dialogue:
                     self._record(index, parse_typed_reading(line, largest=largest))
         except SessionError as e:
             self._note(f"Not recorded: {e}.")
+        if self._offered == offered:
+            self._offered = None
 
     def _is_answer(self, word: str, arguments: list[str]) -> bool:
         """True if a line is a single word that answers the question about a condition."""
@@ -252,7 +258,9 @@ class Dialogue:
         self._last = index
         self._say(self._text.confirmation(index))
         following = self._next
-        is_end_of_setup = following is None or recording.rows[following].setup != row.setup
+        is_end_of_setup = (
+            following is None or recording.rows[following].setup_in_file != row.setup_in_file
+        )
         warned = False
         if self._is_doubtful(index) or is_end_of_setup or corrected:
             warned = self._judge(last=index)
@@ -408,25 +416,29 @@ class Dialogue:
             SessionError: If there is no such line, or the command cannot be executed now.
         """
         lines = [str(row.line) for row in self._recording.rows]
-        if name == "back" and line in self._dropped and line not in lines:
-            self._restore(line)
+        number = int(line) if line.isdecimal() and len(line) < LONGEST_NUMBER else 0
+        if name == "back" and line not in lines and self._recording.is_deleted(number):
+            self._restore(number)
             return
         if line and line not in lines:
-            raise SessionError(self._describe_missing(line, lines))
+            raise SessionError(self._describe_missing(line, number, lines))
         commands = {
             **{"back": self._back, "repeat": self._repeat},
             **{"drop": self._drop, "restart": self._restart},
         }
         commands[name](lines.index(line) if line else None)
 
-    def _describe_missing(self, line: str, lines: Sequence[str]) -> str:
-        """Reason why there is no such line."""
-        now = line
-        while now in self._restored and now not in lines:
-            now = self._restored[now]
-        if now in self._dropped:
-            return f"line {line} was deleted; `back {now}` adds it again, as the last line"
-        if now != line:
+    def _describe_missing(self, line: str, number: int, lines: Sequence[str]) -> str:
+        """Reason why there is no such line.
+
+        Args:
+            line: The line as typed.
+            number: Its number; 0 if it is none.
+            lines: All lines.
+        """
+        if self._recording.is_deleted(number):
+            return f"line {line} was deleted; `back {line}` adds it again, as the last line"
+        if now := self._recording.present_line(number):
             return f"line {line} is line {now} now"
         return f"'{shorten(line)}' is not a line; expected {lines[0]} to {lines[-1]}"
 
@@ -498,10 +510,8 @@ class Dialogue:
 
     def _drop(self, index: int | None) -> None:
         index = self._require_row() if index is None else index
-        rows = [self._recording.rows[i] for i in self._recording.point(index)]
-        row, count = self._recording.rows[index], len(rows)
+        row, count = self._recording.rows[index], len(self._recording.point(index))
         stated = self._recording.drop(index)
-        self._dropped[str(row.line)] = rows
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - count
         self._note(
@@ -513,11 +523,9 @@ class Dialogue:
         self._judge()
         self._ask_for_next()
 
-    def _restore(self, line: str) -> None:
-        index = self._recording.restore(self._dropped[line])
-        del self._dropped[line]
+    def _restore(self, line: int) -> None:
+        index = self._recording.restore(line)
         row = self._recording.rows[index]
-        self._restored[line] = str(row.line)
         self._note(f"Added: line {row.line}, {self._text.label(row)}.")
         self._ask_for(index)
 
@@ -527,9 +535,17 @@ class Dialogue:
         if index is None:
             raise SessionError("no line is asked for; `restart 7` reads the setup of line 7 again")
         recording = self._recording
-        setup = self._text.name(recording.rows[index])
+        setup = recording.rows[index].setup_in_file
+        indices = [i for i, r in enumerate(recording.rows) if r.setup_in_file == setup]
+        count = len({recording.rows[i].line for i in indices if recording.rows[i].is_read})
+        if count and self._offered != setup:
+            self._offered = setup
+            self._note(
+                f"`restart` deletes {counted(count, 'reading')} of {setup}. Type it again to "
+                "delete; any other line keeps them."
+            )
+            return
         recording.empty(index)
-        indices = [i for i, r in enumerate(recording.rows) if self._text.name(r) == setup]
         self._skipped -= {recording.rows[i].key for i in indices}
         self._shown, self._last = None, None
         self._note(f"Deleted: all readings of {setup}")

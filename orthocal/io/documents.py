@@ -31,7 +31,7 @@ from pydantic_core import PydanticCustomError
 from orthocal.errors import OrthocalError
 from orthocal.io.files import read_file
 from orthocal.io.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, load_yaml
-from orthocal.text import composed, shorten, text_problem, uncapitalised
+from orthocal.text import composed, list_some, shorten, text_problem, uncapitalised
 
 Record = TypeVar("Record")
 
@@ -352,7 +352,8 @@ def validate(
         under: Key of the data in the file.
 
     Raises:
-        OrthocalError: Of kind `error`, if the data are invalid; names the first invalid key.
+        OrthocalError: Of kind `error`, if the data are invalid; names the first invalid key, or all
+            missing ones.
     """
     if not isinstance(data, Mapping):
         kinds = {str: "text", int: "a number", float: "a number", list: "a list", bool: "a word"}
@@ -362,7 +363,7 @@ def validate(
     try:
         return cast("Record", _adapter(schema).validate_python(data))  # type: ignore[arg-type] # types are hashable
     except ValidationError as e:
-        key, problem = explain_validation_error(e, schema)
+        key, problem = explain_validation_error(e, schema, under=under)
         key = ".".join(name for name in (under, key) if name)
         raise error(problem, where=f"{where}: {key}" if key else where) from None
 
@@ -395,8 +396,26 @@ PARSED = {"float_parsing": "a number", "int_parsing": "a whole number"}
 """Expected input by pydantic's error types for texts that are not numbers."""
 
 
-def explain_validation_error(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
-    """Key and problem of the first error in a pydantic ValidationError."""
+def describe_missing(others: Sequence[str]) -> str:
+    """Problem of a missing key.
+
+    Args:
+        others: The other missing keys of the document.
+    """
+    so = "is" if len(others) == 1 else "are"
+    return f"is missing, and so {so} {list_some(others, MOST_SHOWN)}" if others else "is missing"
+
+
+def explain_validation_error(
+    exception: ValidationError, schema: type[Any], *, under: str = ""
+) -> tuple[str, str]:
+    """Key and problem of the first error in a pydantic ValidationError.
+
+    Args:
+        exception: The error.
+        schema: The model or dataclass.
+        under: Key of the data in the file, for other keys in the problem.
+    """
     # an unknown key may be a misspelled required key: name it before the missing one
     errors = exception.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] not in UNKNOWN_KEY)
@@ -410,7 +429,9 @@ def explain_validation_error(exception: ValidationError, schema: type[Any]) -> t
         hint = f"; known keys: {', '.join(keys)}" if keys else ""
         return key, f"unknown key{hint}"
     if kind == "missing":
-        return key, "is missing"
+        missing = [e["loc"] for e in errors if e["type"] == "missing" and e is not first]
+        others = [_join(list(loc)) for loc in missing if not any(map(_is_pydantic_tag, loc))]
+        return key, describe_missing([f"{under}.{k}" if under else k for k in others])
     message = str(first["msg"]).removeprefix("Value error, ")
     if kind in ("value_error", "assertion_error"):
         # the message of a validator of several keys has the form "KEY|PROBLEM"

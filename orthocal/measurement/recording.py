@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -43,6 +43,7 @@ from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.points import Coordinate
 from orthocal.sensors.protocol import largest_reading
+from orthocal.session.order import order_of_measurement
 from orthocal.session.points import base_name, gather_points
 from orthocal.session.session import (
     Conditions,
@@ -87,12 +88,32 @@ class Change(Keys):
     conditions: Conditions | None = None
     """Conditions stated with the value; those that are None do not change, except that an approach
     is planned unless it is stated."""
+    line: int | None = None
+    """Line of a deleted row, by which it can be added again."""
 
 
 class _JournalLine(Change):
     at: str
     before: str
     after: str
+
+
+class _Temperature(Keys):
+    """Line of the journal: temperature that is recorded with the next readings, [°C]."""
+
+    temperature: Annotated[Number, Field(alias="temperature_C")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Past:
+    """Content of a journal."""
+
+    closed: list[_JournalLine]
+    """Changes of the recordings that ended regularly."""
+    lines: list[tuple[str, _JournalLine]]
+    """Later changes with their places."""
+    temperature: float | None
+    """Temperature that was typed last, [°C]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +125,11 @@ class RecordedReading(Reading):
     """
 
     has_typed_approach: bool = False
+
+    @property
+    def setup_in_file(self) -> str:
+        """Name of the setup in the files; the three setups of a point have one name there."""
+        return base_name(self.setup)
 
     @property
     def planned_approach(self) -> str | None:
@@ -155,7 +181,7 @@ def change_rows(rows: Sequence[RecordedReading], change: Change) -> tuple[Record
             changed[index] = rows[index].with_reading(value * MM, change.conditions)
     elif change.done == "emptied":
         setup = base_name(keys[0][0])
-        changed = [r.emptied if base_name(r.setup) == setup else r for r in changed]
+        changed = [r.emptied if r.setup_in_file == setup else r for r in changed]
     elif change.done == "dropped":
         changed = [row for i, row in enumerate(changed) if i not in selected]
     else:
@@ -173,6 +199,28 @@ def change_rows(rows: Sequence[RecordedReading], change: Change) -> tuple[Record
     return tuple(changed)
 
 
+def _replay(
+    changes: Iterable[Change],
+) -> tuple[set[ReadingKey], dict[int, list[ReadingKey]]]:
+    """Keys of the rows whose approach was typed, and keys without readings of deleted rows by line.
+
+    Args:
+        changes: All changes, the first one first.
+    """
+    typed: set[ReadingKey] = set()
+    dropped: dict[int, list[ReadingKey]] = {}
+    for change in changes:
+        if change.done == "dropped" and change.line is not None:
+            dropped[change.line] = [key[:4] if key in typed else key for key in change.rows]
+        if change.done in ("read", "dropped"):
+            typed.difference_update(change.rows)
+        if change.done == "read" and change.conditions and change.conditions.approach:
+            known = known_approach(change.conditions)
+            places = [key[:4] for key in change.rows]
+            typed.update(place if known is None else (*place, known) for place in places)
+    return typed, dropped
+
+
 def _recorded_rows(
     readings: Sequence[Reading], changes: Iterable[Change]
 ) -> tuple[RecordedReading, ...]:
@@ -182,14 +230,7 @@ def _recorded_rows(
         readings: The readings as in the CSV.
         changes: All changes that the journal contains and the CSV has.
     """
-    typed: set[ReadingKey] = set()
-    for change in changes:
-        if change.done in ("read", "dropped"):
-            typed.difference_update(change.rows)
-        if change.done == "read" and change.conditions and change.conditions.approach:
-            known = known_approach(change.conditions)
-            places = [key[:4] for key in change.rows]
-            typed.update(place if known is None else (*place, known) for place in places)
+    typed, _ = _replay(changes)
     return tuple(
         RecordedReading(
             *(r.setup, r.posture, r.minus, r.cycle, r.value, r.line, r.file, r.conditions),
@@ -207,6 +248,8 @@ class Recording:
         rows: Its rows in the order of measurement; NaN before they are read.
         journal: Journal of the changes.
         digest: Digest of the CSV on disk.
+        dropped: Keys of the rows that earlier recordings deleted, by their line.
+        temperature: Temperature that was typed last, [°C].
         restored: Number of changes that a killed recording had not written to the CSV.
         edited: Whether the CSV differs from all versions that the killed recording wrote.
         wrong: Errors of readings out of range in the CSV, which count as missing.
@@ -219,6 +262,8 @@ class Recording:
         journal: Journal,
         *,
         digest: str,
+        dropped: Mapping[int, list[ReadingKey]],
+        temperature: float | None = None,
         restored: int = 0,
         edited: bool = False,
         wrong: Sequence[SessionError] = (),
@@ -228,8 +273,10 @@ class Recording:
         self.restored = restored
         self.edited = edited
         self.wrong = tuple(wrong)
+        self.temperature = temperature
         self._journal = journal
         self._digest = digest
+        self._dropped = dict(dropped)
 
     @property
     def path(self) -> Path:
@@ -280,11 +327,11 @@ class Recording:
     def next_empty(self, skipped: frozenset[ReadingKey] = frozenset()) -> int | None:
         """Index of the next row without a reading, except those that are skipped.
 
-        All rows of a setup precede those of the next setup, added rows included.
+        Added rows are read with their setup, before its closing reading.
         """
-        setups = list(dict.fromkeys(row.setup for row in self.rows))
-        empty = [i for i in self.missing if self.rows[i].key not in skipped]
-        return min(empty, key=lambda i: (setups.index(self.rows[i].setup), i), default=None)
+        empty = {i for i in self.missing if self.rows[i].key not in skipped}
+        order = order_of_measurement([row.emptied for row in self.rows])
+        return next((i for i in order if i in empty), None)
 
     def value(self, index: int) -> float | Array:
         """Reading of a row, [m], or coordinates of its point in its station, shape (3,), [m]."""
@@ -351,7 +398,7 @@ class Recording:
         row = self.rows[index]
         if len(self.rows) >= MOST_READINGS:
             raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
-        same_setup = [r for r in self.rows if r.setup == row.setup]
+        same_setup = [r for r in self.rows if r.setup_in_file == row.setup_in_file]
         difference = self.session.is_difference(row)
         cycle = 1 + max(r.cycle for r in same_setup if difference or _has_same_cycles(row, r))
         in_cycle = [r for r in same_setup if r.cycle == cycle]
@@ -376,10 +423,23 @@ class Recording:
         rows = self.point(index)
         if len(self.rows) == len(rows):
             raise SessionError("it is the only row; a session has at least one")
-        change = Change(done="dropped", rows=[self.rows[i].key for i in rows])
+        line, keys = self.rows[index].line, [self.rows[i].key for i in rows]
+        emptied = [self.rows[i].emptied.key for i in rows]
+        change = Change(done="dropped", rows=keys, line=line)
         stated = self._state_alignment(change_rows(self.rows, change))
         self._apply(change)
+        if line is not None:
+            self._dropped[line] = emptied
         return stated
+
+    def is_deleted(self, line: int) -> bool:
+        """True for the line of a row that was deleted and not added again."""
+        return line in self._dropped and self.present_line(line) is None
+
+    def present_line(self, line: int) -> int | None:
+        """Line of a deleted row since it was added again; None for other rows."""
+        keys = self._dropped.get(line, [])
+        return next((r.line for r in self.rows if r.emptied.key in keys), None)
 
     def _state_alignment(self, remaining: Sequence[Reading]) -> dict[str, str]:
         """State the alignment postures in the session.yaml that the remaining rows would change."""
@@ -393,19 +453,31 @@ class Recording:
         self.session = replace(session, setups={**session.setups, **aligned})
         return stated
 
-    def restore(self, dropped: Sequence[RecordedReading]) -> int:
-        """Append deleted rows without their readings, and return the index of the first.
+    def restore(self, line: int) -> int:
+        """Append a deleted row, or the three rows of a point, without readings.
 
         Args:
-            dropped: A row, or the three rows of a point.
+            line: Line of the row before it was deleted; see `is_deleted`.
+
+        Returns:
+            Index of the first appended row.
 
         Raises:
-            SessionError: If such a row exists again.
             OutputError: If the files cannot be written.
         """
+        dropped = self._dropped[line]
         existing = [r.key for r in self.rows[: len(dropped)]]
-        self._apply(Change(done="added", rows=[*existing, *(r.emptied.key for r in dropped)]))
+        self._apply(Change(done="added", rows=[*existing, *dropped]))
         return len(self.rows) - len(dropped)
+
+    def note_temperature(self, temperature: float) -> None:
+        """Keep the temperature, [°C], of the next readings for the next recording.
+
+        Raises:
+            OutputError: If the journal cannot be written.
+        """
+        self._journal.append({"temperature_C": temperature})
+        self.temperature = temperature
 
     def empty(self, index: int) -> None:
         """Delete all readings of a row's setup, with all that was typed; the journal has them.
@@ -490,7 +562,8 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
-        closed, lines = _read_lines(journal)
+        past = _read_lines(journal)
+        closed, lines = past.closed, past.lines
         if _is_outdated(session):  # another process may have written before the lock
             session = load_plan(path, wrong=wrong)
         for file, content in _files_to_add(session).items():
@@ -515,6 +588,8 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             rows,
             journal,
             digest=_digest(table),
+            dropped=_find_dropped(session, [*closed, *(change for _, change in lines)]),
+            temperature=past.temperature,
             restored=len(pending),
             edited=edited,
             wrong=wrong,
@@ -523,6 +598,22 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             yield recording
         finally:
             recording.close()
+
+
+def _find_dropped(session: Session, changes: Iterable[Change]) -> dict[int, list[ReadingKey]]:
+    """Keys of the deleted rows by line, unless their setup or posture was deleted since.
+
+    Args:
+        session: The session.
+        changes: All changes that the journal contains.
+    """
+    _, dropped = _replay(changes)
+    postures = {None, *session.postures}
+    return {
+        line: keys
+        for line, keys in dropped.items()
+        if all(k[0] in session.setups and postures.issuperset(k[1:3]) for k in keys)
+    }
 
 
 def _files_to_add(session: Session) -> dict[Path, bytes]:
@@ -581,11 +672,9 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _read_lines(journal: Journal) -> tuple[list[_JournalLine], list[tuple[str, _JournalLine]]]:
-    """Changes of the recordings that ended regularly, and later ones with their places.
-
-    A new journal gets its header.
-    """
+def _read_lines(journal: Journal) -> _Past:
+    """Content of a journal; a new one gets its header."""
+    temperature = None
     closed: list[_JournalLine] = []
     lines: list[tuple[str, _JournalLine]] = []
     has_header = False
@@ -601,6 +690,10 @@ def _read_lines(journal: Journal) -> tuple[list[_JournalLine], list[tuple[str, _
             lines.clear()
         elif has_header:
             try:
+                if data is not None and data.keys() == {"temperature_C"}:
+                    noted = validate(_Temperature, data, where=where, error=OrthocalError)
+                    temperature = noted.temperature
+                    continue
                 line = validate(_JournalLine, data, where=where, error=OrthocalError)
             except OrthocalError:
                 raise OrthocalError(
@@ -612,7 +705,7 @@ def _read_lines(journal: Journal) -> tuple[list[_JournalLine], list[tuple[str, _
         has_header = True
     if not has_header:
         journal.append({"format": FORMAT})
-    return closed, lines
+    return _Past(closed, lines, temperature)
 
 
 def _find_pending(

@@ -201,7 +201,11 @@ def show_readings(
         SessionError: If the noise is not stated.
     """
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
-    noise = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
+    if sigma is None and not exact:
+        used = dict.fromkeys(s.gauge for s in plan.setups.values())
+        silent = [name for name in used if plan.gauges[name].sigma is None]
+        plan.refuse_missing(silent, "sigma_mm", ": the noise to simulate is not stated")
+    noise = np.array([(g.sigma if sigma is None else sigma) or 0.0 for g in gauges])
     # the operator sets the dial near 0 in the first posture of a setup
     zeros = dict.fromkeys(plan.setups, 0.0)
     for i, (name, setup) in enumerate(plan.setups.items()):
@@ -227,17 +231,6 @@ def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
     if limits is None or not plan.is_difference(reading):
         return limits
     return limits[0] - limits[1], limits[1] - limits[0]
-
-
-def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
-    """Standard deviation of a gauge's simulated readings, [m]."""
-    noise = plan.gauges[gauge].sigma if sigma is None else sigma
-    if noise is None and not exact:
-        raise SessionError(
-            "is missing: the noise to simulate is not stated",
-            where=plan.locate_gauge_key(gauge, "sigma_mm"),
-        )
-    return noise or 0.0
 
 
 class _TruthKeys(Keys):

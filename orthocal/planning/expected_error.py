@@ -24,7 +24,7 @@ from orthocal.assessment.tool_error import (
     ToolUncertainty,
     measure_uncertainty,
 )
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
@@ -436,16 +436,16 @@ def state_noise(session: Session) -> Session:
         SessionError: If the repeatability of a gauge is unknown.
     """
     o = build_observations(session)
-    gauges = dict(session.gauges)
+    gauges, unknown = dict(session.gauges), []
     for group in split_by_gauge(session, o):
         if group.gauge.sigma is not None or group.gauge.resolution is not None:
             continue
         values = o.values(session.values)[group.entries]
         sigma, dof = estimate_repeatability(values, o.only(group.entries))
-        if not (dof and sigma > 0.0):
-            raise SessionError(
-                "is missing; a plan needs the repeatability of the readings",
-                where=session.locate_gauge_key(group.name, "sigma_mm"),
-            )
-        gauges[group.name] = replace(group.gauge, sigma=sigma)
+        if dof and sigma > 0.0:
+            gauges[group.name] = replace(group.gauge, sigma=sigma)
+        else:
+            unknown.append(group.name)
+    reason = "; a plan needs the repeatability of the readings"
+    session.refuse_missing(unknown, "sigma_mm", reason)
     return replace(session, gauges=gauges)

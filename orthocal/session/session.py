@@ -7,7 +7,7 @@ unknown gauge zero cancels in a difference.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -22,7 +22,7 @@ from orthocal.arrays import Array
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import with_effects
 from orthocal.errors import SessionError
-from orthocal.io.documents import Number
+from orthocal.io.documents import Number, describe_missing
 from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
@@ -328,6 +328,23 @@ class Session:
         file = self.path_of(label) if self.joined else self.path
         path = f"gauges.{name}.{key}" if name else f"gauge.{key}"
         return path if file is None else f"{file}: {path}"
+
+    def refuse_missing(self, gauges: Iterable[str], key: str, reason: str) -> None:
+        """Refuse gauges that do not state a key.
+
+        Args:
+            gauges: Names of the gauges without the key.
+            key: The key.
+            reason: End of the message, from its punctuation mark.
+
+        Raises:
+            SessionError: If there are such gauges; names all of them.
+        """
+        missing = [self.locate_gauge_key(gauge, key) for gauge in gauges]
+        if missing:
+            file, mark, _ = missing[0].rpartition(": ")
+            others = [name.removeprefix(file + mark) for name in missing[1:]]
+            raise SessionError(f"{describe_missing(others)}{reason}", where=missing[0])
 
     def with_gauge(self, gauge: Gauge) -> Session:
         """Session with one gauge for all setups."""

@@ -18,7 +18,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.registry import order_effects
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.selection import Selection
 from orthocal.kinematics.reachable_box import find_workspace
@@ -192,7 +192,8 @@ def build_accuracy_study(
     names = _select_drawn(drawn, fixed, parameters)
     chosen = replace(chosen, effects=None, tolerances=_tolerances_of_model(chosen, session, plan))
     chosen.select(session.robot.parameters)
-    _require_noise(session)
+    silent = [name for name, gauge in session.gauges.items() if gauge.sigma is None]
+    session.refuse_missing(silent, "sigma_mm", ": the study needs the noise of the gauge")
     require_conditions(plan, names)
     box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
@@ -205,16 +206,6 @@ def build_accuracy_study(
         seed=seed,
         box=tuple((float(low), float(high)) for low, high in box),
     )
-
-
-def _require_noise(session: Session) -> None:
-    """Refuse a session with a gauge whose noise is not stated."""
-    for name, gauge in session.gauges.items():
-        if gauge.sigma is None:
-            raise SessionError(
-                "is missing: the study needs the noise of the gauge",
-                where=session.locate_gauge_key(name, "sigma_mm"),
-            )
 
 
 def _tolerances_of_model(choice: Choice, session: Session, measured: Session) -> dict[str, float]:

@@ -20,8 +20,10 @@ from orthocal.io.tables.numerals import parse_typed_reading
 from orthocal.measurement import recording as module
 from orthocal.measurement.files import session_file
 from orthocal.measurement.files.session_file import load_plan
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
+from orthocal.session.session import Conditions
 from orthocal.units import MM
 
 STEPS = (*range(3, 11, 2), *range(40, 48))
@@ -174,6 +176,52 @@ def test_added_rows_are_asked_for_with_their_setup(plan):
         assert r.next_empty() == added == of_setup[-1]
         before = [row.line for row in r.rows]
     assert [row.line for row in load_plan(plan).readings] == before
+
+
+def test_the_closing_reading_follows_added_rows_in_record_and_on_the_sheet(plan):
+    """Rows that are added to the file, repeated, or deleted and added again."""
+    rows = ["yx,zero,1,", "yx,x_max,1,", "yx,x_min,1,", "yx,zero,2,", "yx,x_max,2,"]
+    rows += ["zx,zero,1,", "zx,x_max,1,", "zx,x_min,1,", "zx,zero,2,"]
+    (plan / "readings.csv").write_text("\n".join(["setup,posture,cycle,reading_mm", *rows, ""]))
+    with (plan / "session.yaml").open("a") as stream:
+        stream.write("readings: readings.csv\n")
+    asked = []
+    with open_recording(plan) as r:
+        r.drop(7)  # line 9
+        r.restore(9)  # line 11
+        r.repeat(1)  # line 3 again: line 12
+        while (i := r.next_empty()) is not None:
+            asked.append(r.rows[i].line)
+            r.read(i, 0.0)
+    assert asked == [2, 3, 4, 6, 12, 5, 7, 8, 11, 10]
+    motions = plan_motion(load_plan(plan))
+    assert [s.line for m in motions for s in m.stops] == asked
+    assert {s.role for m in motions for s in m.stops} == {"reading"}
+
+
+def test_deleted_rows_and_the_temperature_are_known_to_the_next_recording(plan):
+    with open_recording(plan) as r:
+        r.read(1, 0.1 * MM, Conditions("nnn", 21.0))
+        r.drop(1)  # line 3, with a typed approach
+        r.drop(2)  # line 5
+        r.restore(5)  # line 14
+        r.note_temperature(21.0)
+        r.note_temperature(22.5)
+    with open_recording(plan) as r:
+        assert r.temperature == 22.5
+        assert [line for line in range(20) if r.is_deleted(line)] == [3]
+        assert [r.present_line(line) for line in (3, 5, 6)] == [None, 14, None]
+        index = r.restore(3)
+        assert r.rows[index].label_with_cycle == "yx x_max"
+        assert (r.rows[index].line, r.rows[index].approach, r.is_deleted(3)) == (15, None, False)
+        r.drop(0)
+    text = (plan / "session.yaml").read_text()  # the operator removes the posture of line 2
+    (plan / "session.yaml").write_text(text.replace("zero:", "other:"))
+    table = (plan / "readings.csv").read_text()
+    (plan / "readings.csv").write_text(table.replace("zero", "other"))
+    with open_recording(plan) as r:
+        assert not r.is_deleted(2)
+        assert r.present_line(3) == 15
 
 
 def test_a_repeated_difference_gets_a_cycle_that_holds_no_readings_of_another_form(plan):

@@ -19,7 +19,7 @@ from orthocal.effects.adjustment import require_adjustment
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import load_robot, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
-from orthocal.io.documents import read_yaml, validate
+from orthocal.io.documents import describe_missing, read_yaml, validate
 from orthocal.io.files import (
     content_withheld_outside,
     exists,
@@ -377,6 +377,7 @@ def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
     for name in keys.adjusted_mm:
         require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
+    _require_gauges(stated, gauges, file)
     setups = {}
     for name, (setup, sensor) in stated.items():
         where = f"{file}: setups.{name}"
@@ -438,13 +439,20 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
             )
 
 
+def _require_gauges(stated: _Setups, gauges: Mapping[str, Gauge], file: Path) -> None:
+    """Refuse setups without a gauge in a session with several gauges."""
+    missing = [f"setups.{name}.gauge" for name, (keys, _) in stated.items() if keys.gauge is None]
+    if missing and len(gauges) > 1:
+        first, *others = missing
+        raise SessionError(
+            f"{describe_missing(others)}; expected one of {', '.join(gauges)}",
+            where=f"{file}: {first}",
+        )
+
+
 def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
     """Name of a setup's gauge."""
     if setup.gauge is None:
-        if len(gauges) > 1:
-            raise SessionError(
-                f"is missing; expected one of {', '.join(gauges)}", where=f"{where}.gauge"
-            )
         return next(iter(gauges))
     if setup.gauge not in gauges or not setup.gauge:
         names = ", ".join(name for name in gauges if name)

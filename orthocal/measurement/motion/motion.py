@@ -40,6 +40,7 @@ from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import Contact, Sensor, ToolPath, has_dial, instrument, tool_path
+from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
 
@@ -136,6 +137,11 @@ class Stop:
     """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
     do not command the tool."""
 
+    @property
+    def label(self) -> str:
+        """Line of readings.csv, or the posture of a stop without a reading."""
+        return self.posture if self.line is None else f"line {self.line}"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupMotion:
@@ -150,6 +156,15 @@ class SetupMotion:
     """Stop in the alignment posture; None if that is the first posture of `stops`."""
     stops: tuple[Stop, ...]
     """Stops in the postures to read, and in the first of them again."""
+
+    @property
+    def lifting(self) -> str:
+        """Instruction for the motions during which the plunger is held up; empty without them."""
+        lifted = [s for s in self.stops if s.lift]
+        if not lifted:
+            return ""
+        places = ", ".join(dict.fromkeys(s.label for s in lifted))
+        return f"Hold the plunger up on the way to {places}: {lifted[0].lift} there."
 
     def closing(self, stop: Stop, sensor: Sensor) -> str:
         """Instruction for a stop that repeats the first posture; empty for other stops."""
@@ -173,7 +188,7 @@ class _Path(NamedTuple):
 
 
 def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
-    """Plan the path through every setup, in the order of the rows.
+    """Plan the path through every setup, in the order of measurement.
 
     Raises:
         SessionError: If there are too many readings, or a posture cannot be reached or approached.
@@ -184,7 +199,8 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
             where=str(session.path or "session"),
         )
     rows_by_setup: dict[str, list[tuple[int, Reading]]] = {}
-    for i, reading in enumerate(session.readings):
+    for i in order_of_measurement(session.readings):
+        reading = session.readings[i]
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
@@ -416,10 +432,10 @@ def _list_stops(
     *,
     any_side: bool = False,
 ) -> list[Stop]:
-    """Alignment of the gauge, stops in the order of the rows, and the first posture again.
+    """Alignment of the gauge, stops in the order of measurement, and the first posture again.
 
     Args:
-        rows: Lines and readings of the setup.
+        rows: Lines and readings of the setup in this order.
         aligned_at: Alignment posture.
         stop_at: Stops by posture and stated approach.
         any_side: Whether the first posture may be reached again from any side.

@@ -212,7 +212,7 @@ def _programs(options: ProgramOptions | None, *, with_bar: bool) -> str:
     if options.automatic:
         stops = (
             "stop (M0) where you mount the gauge, set its dial or hold its plunger. A logger reads "
-            "the gauge: its values are in the order of the lines"
+            "the gauge: its values are in the order of the tables"
         )
     return paragraph(
         f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "
@@ -365,13 +365,11 @@ def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> st
         if beyond:
             texts.append(
                 "Even a perfect machine shows "
-                f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {_name(beyond[0])}, "
+                f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {beyond[0].label}, "
                 "beyond the range of the dial. Choose another posture or another dial."
             )
-    lifted = [s for s in motion.stops if s.lift]
-    if lifted:
-        places = ", ".join(dict.fromkeys(_name(s) for s in lifted))
-        texts.append(f"Lift the plunger on the way to {places}: {lifted[0].lift} there.")
+    if motion.lifting:
+        texts.append(motion.lifting)
     return "".join(paragraph(text, kind="warn") for text in texts)
 
 
@@ -439,16 +437,12 @@ def _posture(stop: Stop) -> str:
     return f"{stop.posture}, cycle {stop.cycle}"
 
 
-def _name(stop: Stop) -> str:
-    return stop.posture if stop.line is None else f"line {stop.line}"
-
-
 def _afterwards(session: Session, command: str) -> str:
     points = [isinstance(s.sensor, Points) for s in session.setups.values()]
     columns = ["reading_mm"] * (not all(points)) + ["x_mm, y_mm and z_mm"] * any(points)
     steps = [
         "Enter the readings with `orthocal record`, which checks each one at once. Or type them "
-        f"into readings.csv, column {' or '.join(columns)}, in the order of its lines. Delete the "
+        f"into readings.csv, column {' or '.join(columns)}, each into its line. Delete the "
         "line of a reading that you could not take. `orthocal import` reads a spreadsheet.",
         "Run:",
     ]

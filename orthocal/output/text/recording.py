@@ -15,6 +15,7 @@ import numpy as np
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
+from orthocal.errors import OrthocalError
 from orthocal.measurement.motion.approach import (
     approach_length,
     common_approach,
@@ -22,15 +23,15 @@ from orthocal.measurement.motion.approach import (
     fill_approach,
     label_reading,
 )
-from orthocal.measurement.motion.motion import guide, set_dial
-from orthocal.measurement.recording import Recording
+from orthocal.measurement.motion.motion import guide, plan_motion, set_dial
+from orthocal.measurement.recording import RecordedReading, Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
 from orthocal.robot.model import drive_keys
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
-from orthocal.session.points import base_name
+from orthocal.session.points import base_name, one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, spans
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
@@ -50,7 +51,7 @@ COMMANDS = {
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if gauge or stand has moved; "
-    "`restart 7` the setup of line 7",
+    "`restart 7` the setup of line 7; it is typed twice",
     "temperature": "temperature in °C of this reading and the next ones, such as `t 22.5`; after "
     "`back`, of the corrected reading only",
     "side": "approach of this reading and the next ones, unless the plan states it: `side n`; "
@@ -164,7 +165,7 @@ class RecordingText:
         restored = recording.restored
         every, done = recording.count, recording.count - recording.missing_count
         title = f"{session.title}: " if session.title else ""
-        count = counted(len({base_name(r.setup) for r in rows}), "setup")
+        count = counted(len({r.setup_in_file for r in rows}), "setup")
         state = "none is recorded yet" if not done else f"{done} are recorded"
         parts = [f"{title}{counted(every, 'reading')} in {count} on {session.robot.name}; {state}."]
         if restored:
@@ -184,6 +185,11 @@ class RecordingText:
             f"{self._what_to_type()} It is stored at once. `help` lists the commands. "
             "Lines are those of the sheet and of readings.csv."
         )
+        if recording.temperature is not None:
+            parts.append(
+                f"Noted with the next readings, as typed before: {recording.temperature:g} °C. "
+                "`t 20` changes it."
+            )
         length = approach_length(session)
         parts.append(
             f"Approach each posture as its arrows show: in the last {length} the displayed number "
@@ -212,7 +218,7 @@ class RecordingText:
         Empty if the setup has no gauge that stays in its place.
         """
         row = self._recording.rows[index]
-        setup, name = self._session.setups[row.setup], self.name(row)
+        setup, name = self._session.setups[row.setup], row.setup_in_file
         if reads_pairs(setup.sensor):
             return ""
         return (
@@ -221,16 +227,21 @@ class RecordingText:
             "again."
         )
 
-    def setup(self, name: str) -> str:
-        """Position of the gauge of a setup, and preparation of its dial."""
+    def setup(self, index: int) -> str:
+        """Position of the gauge of a row's setup, and preparation of its dial."""
         session, rows = self._session, self._recording.rows
+        name, in_file = rows[index].setup, rows[index].setup_in_file
         setup = session.setups[name]
-        names = list(dict.fromkeys(base_name(r.setup) for r in rows))
-        of_setup = [r for r in rows if r.setup == name]
+        names = list(dict.fromkeys(r.setup_in_file for r in rows))
+        of_setup = [
+            r
+            for i, r in enumerate(rows)
+            if r.setup_in_file == in_file and self._recording.point(i)[0] == i
+        ]
         aligned, first = self._guidance.aligned_at[name], of_setup[0].minus or of_setup[0].posture
         go = "" if aligned == first else f"Then go to {first}. "
         title = (
-            f"Setup {self.name(of_setup[0])}, {names.index(base_name(name)) + 1} of {len(names)}: "
+            f"Setup {in_file}, {names.index(in_file) + 1} of {len(names)}: "
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
@@ -248,6 +259,8 @@ class RecordingText:
                 f"Go to {aligned} and align the {gauge}. {go}{set_dial(session, name)} From then "
                 f"on do not touch the {gauge_or_stand} until the setup is complete."
             )
+        if any(not r.is_read for r in of_setup):
+            parts.append(self._lifting(of_setup))
         if all(map(session.is_difference, of_setup)):
             parts.append(
                 "Each line is a difference: the reading in its first posture minus that in its "
@@ -257,6 +270,19 @@ class RecordingText:
         if aligned != first and not isinstance(setup.sensor, Points):
             lines.append(self._coordinates(aligned, f"{aligned}: "))
         return "\n".join(lines)
+
+    def _lifting(self, readings: Sequence[Reading]) -> str:
+        """Motions of a setup during which the plunger is held up, as the sheet names them.
+
+        Args:
+            readings: The readings of the setup.
+        """
+        session = replace(self._session, readings=tuple(readings), sha256="")
+        try:
+            (motion,) = plan_motion(one_row_per_point(session))
+        except OrthocalError:  # the machine cannot go through the plan, so there is no sheet
+            return ""
+        return motion.lifting
 
     def _stand(self, setup: str) -> str:
         steps = mounting_steps(self._session.setups[setup].sensor)
@@ -277,14 +303,9 @@ class RecordingText:
             "with the opposite sign."
         )
 
-    def label(self, row: Reading) -> str:
+    def label(self, row: RecordedReading) -> str:
         """Setup, posture with the arrows of its approach, and the cycle from the second on."""
-        return label_reading(self._session.robot, replace(row, setup=self.name(row)))
-
-    def name(self, row: Reading) -> str:
-        """Name of the setup of a row, as in the files."""
-        point = isinstance(self._session.setups[row.setup].sensor, Points)
-        return base_name(row.setup) if point else row.setup
+        return label_reading(self._session.robot, replace(row, setup=row.setup_in_file))
 
     def value(self, index: int) -> str:
         """Reading of a row, or the coordinates of its point, in mm."""
@@ -346,7 +367,7 @@ class RecordingText:
             text = f"No prediction: all other readings of this setup have a warning ({where})."
             return self.wrap(text, indent="  ")
         of = ""
-        if self.name(row) != row.setup:  # a coordinate of a point
+        if row.setup_in_file != row.setup:  # a coordinate of a point
             of = f" {row.setup.partition('[')[2].rstrip(']')}"
         text = f"The other readings predict{of} {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
         lines = [self.wrap(text, indent="  ")]
@@ -455,9 +476,11 @@ class RecordingText:
         command = printable(shlex.quote(path))
         if recording.missing:
             parts = []
-            for setup in dict.fromkeys(self.name(rows[i]) for i in recording.missing):
-                numbers = [rows[i].line for i in recording.missing if self.name(rows[i]) == setup]
-                every = len(numbers) == sum(self.name(r) == setup for r in rows)
+            for setup in dict.fromkeys(rows[i].setup_in_file for i in recording.missing):
+                numbers = [
+                    rows[i].line for i in recording.missing if rows[i].setup_in_file == setup
+                ]
+                every = len(numbers) == sum(r.setup_in_file == setup for r in rows)
                 which = spans(sorted({line or 0 for line in numbers}), "line")
                 parts.append(f"{setup} {'all' if every else which}")
             count = recording.missing_count
@@ -509,7 +532,7 @@ def _gauge(session: Session, setup: Setup) -> str:
         facts.append(f"{gauge.range[0] / MM:g} to {gauge.range[1] / MM:g} mm")
     if gauge.resolution is not None:
         facts.append(f"resolution {gauge.resolution / MM:g} mm")
-    name = session.distinguish_gauge(setup.gauge)
+    name = base_name(session.distinguish_gauge(setup.gauge))
     if not facts and not name:
         return ""
     noun = instrument(setup.sensor).capitalize()

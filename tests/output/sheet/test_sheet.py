@@ -198,7 +198,8 @@ def test_steps_state_how_to_mount_and_align_the_gauge(page):
     assert "pin of 4 mm diameter, 60 mm wide" in pin
     # the leg moves sideways by more than the range of this dial
     assert "Even a perfect machine shows -32.7 mm in line 6" in blade
-    assert "Lift the plunger on the way to line 5, line 6, in&: the dial would go -32.7 mm" in blade
+    hold = "Hold the plunger up on the way to line 5, line 6, in&: the dial would go -32.7 mm"
+    assert hold in blade
     assert "Even a perfect" not in line
     assert "on the (0.71, 0.71, 0.00) side of rod b of leg z" in pin
 
