@@ -29,7 +29,7 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.cli.options import Array
+    from orthocal.arrays import Array
 
 
 @command()

@@ -43,17 +43,13 @@ from orthocal.text import comment_safe, shorten
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from orthocal.arrays import Array
     from orthocal.export.approach_sides import ApproachSides
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import ProgramCorrector, Summary
     from orthocal.kinematics.conditions import UseCondition
-
-    Array = NDArray[np.float64]
 
 MARK = "Corrected by orthocal"
 """Beginning of the comment that marks a corrected program."""

@@ -16,7 +16,7 @@ from orthocal.errors import ParameterError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.cli.options import Array
+    from orthocal.arrays import Array
 
 Answer = TypeVar("Answer")
 

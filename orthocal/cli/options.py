@@ -20,12 +20,8 @@ from orthocal.text import shorten
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from orthocal.arrays import Array
     from orthocal.effects.compensation import Compensation
-
-    Array = NDArray[np.float64]
 
 Command = TypeVar("Command", bound=Callable[..., None])
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
@@ -222,9 +222,9 @@ class Robot:
     """Errors declared in the YAML, for `orthocal.effects`."""
     parameters: ParameterSet
     """Error parameters, from `orthocal.effects.loading`."""
-    drive_index: NDArray[np.int64]
+    drive_index: Indices
     """Indices of the actuated coordinates, shape (n_drives,)."""
-    passive_index: NDArray[np.int64]
+    passive_index: Indices
     """Indices of the passive coordinates, shape (n_passive,)."""
     reference_posture: Array
     """Joint coordinates with the drives at their mechanical zero, shape (nv,), [m, rad]."""
@@ -380,9 +380,7 @@ class Robot:
             )
         return np.asarray(closing.coordinates[self.passive_index])
 
-    def close_coordinates(
-        self, start: Array, free: NDArray[np.int64], *, limited: bool = True
-    ) -> Closing:
+    def close_coordinates(self, start: Array, free: Indices, *, limited: bool = True) -> Closing:
         """Close the loops by some of the joint coordinates, within their limits by default.
 
         Args:
@@ -550,7 +548,7 @@ def joint_axis(model: pin.Model, joint: int) -> Array:
     return np.asarray(joint_data.S, dtype=np.float64).reshape(-1)
 
 
-def closure_turns(robot: Robot) -> NDArray[np.bool_]:
+def closure_turns(robot: Robot) -> Mask:
     """Mask of the closure rows that are rotations, shape (closure_rows,)."""
     return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
 
@@ -578,7 +576,7 @@ def closure_row_units(robot: Robot) -> Array:
     return np.where(closure_turns(robot), robot.characteristic_length, 1.0)
 
 
-def coordinate_turns(model: pin.Model) -> NDArray[np.bool_]:
+def coordinate_turns(model: pin.Model) -> Mask:
     """Mask of the joint coordinates that are rotations, shape (nv,)."""
     turns = [joint_axis(model, i)[3:].any() for i in range(1, model.njoints)]
     return np.array(turns, dtype=np.bool_)

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import Fit, fit_problem
@@ -87,7 +86,7 @@ class _Prepared:
     """Fitted readings with gauge zeros of 0, shape (n_entries,), [m of the first gauge]."""
     residuals: Array
     """Residuals rescaled to the noise, with mean 0, shape (n,), [m of the first gauge]."""
-    cycles: tuple[tuple[NDArray[np.int64], ...], ...]
+    cycles: tuple[tuple[Indices, ...], ...]
     """Entries of each cycle of each setup, with the same order of places in all cycles."""
     program: BatchSolver
 
@@ -137,9 +136,7 @@ def build_bootstrap_study(
     return study
 
 
-def find_cycles(
-    session: Session, observations: Observations
-) -> tuple[tuple[NDArray[np.int64], ...], ...]:
+def find_cycles(session: Session, observations: Observations) -> tuple[tuple[Indices, ...], ...]:
     """Entries of each cycle of each setup.
 
     Raises:
