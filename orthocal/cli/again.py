@@ -81,8 +81,7 @@ def again(
         new = replace(new, compensation=joints.compensation)
     new = replace(new, offsets_from=calibration)
     _write(new, out, f"orthocal validate {quote_path(os.path.relpath(calibration, out))} .")
-    if order := note_wrong_order(result):
-        put_note(order)
+    put_note(note_wrong_order(result))
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
@@ -108,8 +107,7 @@ def _write(new: orthocal.Session, out: Path, validating: str) -> None:
         f"readings.csv. Compare the readings with the calibration:\n{validating}"
     )
     sheet, problem = sheet_or_problem(new, following=validating)
-    if problem:
-        put_note(problem)
+    put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
 
 
@@ -138,15 +136,15 @@ def _note_other_lines(
                 "and the file joints.ini of the export."
             )
         return
-    differences = describe_other_lines(
-        calibration,
-        joints.compensation,
-        joints.offsets,
-        entered=new.active_offsets,
-        file=str(ini),
+    put_note(
+        describe_other_lines(
+            calibration,
+            joints.compensation,
+            joints.offsets,
+            entered=new.active_offsets,
+            file=str(ini),
+        )
     )
-    if differences:
-        put_note(differences)
 
 
 def _describe_entries(

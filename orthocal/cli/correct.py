@@ -27,7 +27,6 @@ from orthocal.cli.options import (
     Temperature,
     ToolTip,
     command,
-    read_conditions,
     read_vector,
 )
 from orthocal.cli.overwriting import require_replaceable_file
@@ -44,7 +43,6 @@ from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 if TYPE_CHECKING:
     from orthocal.arrays import Array
-    from orthocal.export.approach_sides import ApproachSides
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.path import Vector
@@ -190,10 +188,8 @@ class _Correction:
     field: CorrectionField
     tolerance: float
     """Largest distance of the written path from the corrected path, [m]."""
-    lags: Array
-    """Half of the backlash to be compensated, shape (n_drives,), [m, rad]."""
-    sides: ApproachSides | None
-    """Sides of approach; None if the controller compensates the backlash, or there is none."""
+    backlash: str
+    """Description of the compensation of the backlash; empty if there is none."""
     interpreter: Interpreter
     corrector: ProgramCorrector
     region: str
@@ -207,13 +203,10 @@ class _Correction:
 
         return [
             self.for_controller,
-            self._describe_backlash(),
+            self.backlash,
             describe_conditions_of(self.result, self.conditions, fields=CONDITIONS),
             _describe_tip(self.controller.tip),
         ]
-
-    def _describe_backlash(self) -> str:
-        return _describe_backlash(self.result, self.lags, by_program=self.sides is not None)
 
     def list_notes(self, warning: str) -> list[str]:
         """Notes about the corrected program; empty ones do not apply."""
@@ -227,7 +220,7 @@ class _Correction:
             note_wrong_order(self.result),
             _describe_tip(self.controller.tip) or _describe_tools(tools),
             describe_assumed(self.result, self.conditions, fields=CONDITIONS),
-            self._describe_backlash(),
+            self.backlash,
             warning,
             _describe_uncorrected(self.interpreter.uncorrected, self.file),
             _describe_outside(summary, self.file, self.region),
@@ -256,9 +249,8 @@ def _prepare(
     active, tip = options.offsets is Offsets.ACTIVE, controller.tip
     values = result.active_offsets if active else offsets_to_enter(result)
     tolerance = options.within * UM
-    conditions = read_conditions(
-        result.robot, temperature=options.temperature, payload=options.payload
-    )
+    conditions = orthocal.UseConditions(None, options.temperature, options.payload)
+    conditions.require_valid(result.robot, prefix="--")
     field = CorrectionField(
         result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0), conditions=conditions
     )
@@ -281,8 +273,7 @@ def _prepare(
         conditions=conditions,
         field=field,
         tolerance=tolerance,
-        lags=lags,
-        sides=sides,
+        backlash=_describe_backlash(result, lags, by_program=by_program),
         interpreter=interpreter,
         corrector=ProgramCorrector(
             interpreter, field, within=tolerance, region=region, sides=sides

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import state_tolerances
-from orthocal.errors import SessionError
+from orthocal.cli.options import read_temperatures, split_effects, state_tolerances
+from orthocal.errors import ParameterError, SessionError
+from orthocal.io.files import exists
 from orthocal.text import spans
 
 ROUNDING = 1e-9
@@ -184,19 +185,34 @@ def _are_copied(
     return chance_of_equal_readings(n_equal, count, sigma=sigma, step=step) < COPY_CHANCE
 
 
-def state_conditions(
-    plan: orthocal.Session, temperatures: tuple[float, float] | None
+def load_stated_plan(
+    path: Path, *, effects: str | None, temperature: str | None
 ) -> orthocal.Session:
-    """Plan whose readings state the conditions that the effects of its machine need.
+    """Plan with stated effects, whose readings state the conditions that these effects need.
 
     Args:
-        plan: The plan.
-        temperatures: Temperatures at the first and the last reading, [°C]; by default those of the
-            plan.
+        path: Path of its session.
+        effects: Value of `--effects`; by default the effects of the plan.
+        temperature: Value of `--temperature`; by default the temperatures of the plan.
+
+    Raises:
+        OrthocalError: If the plan does not load, or an option is invalid.
     """
     from orthocal.measurement.motion.approach import state_common_approach
     from orthocal.observation.conditions import needed_conditions, schedule_readings
+    from orthocal.robot.loading import packaged_robots
+    from orthocal.robot.parameters import errors_at
 
+    if not exists(path) and str(path) in packaged_robots():
+        raise ParameterError(
+            f"is a robot; expected a session.yaml, which `orthocal plan {path} --out ...` writes",
+            where=str(path),
+        )
+    plan = orthocal.load_plan(path)
+    if effects is not None:
+        with errors_at("--effects"):
+            plan = plan.with_effects(split_effects(effects))
+    temperatures = read_temperatures(temperature)
     needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
     stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
     if temperatures is not None or (needed and not stated):

@@ -209,8 +209,7 @@ def new(
     _write(folder, name, design)
     _report(folder, design)
     note_beyond_limits(design.session, controller.ini)
-    if design.assumed_tip:
-        put_note(design.assumed_tip)
+    put_note(design.assumed_tip)
     if not design.tolerance_stated:
         put_note(
             f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "

@@ -272,14 +272,6 @@ ToolTip = Annotated[
         help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
     ),
 ]
-Approach = Annotated[
-    str | None,
-    Option(
-        metavar="LETTERS",
-        help="Sides from which the drives come, a letter for each: p if its coordinate grew in the "
-        "last motion, n if it fell, u if unknown, such as pnp; default: the middle of both sides.",
-    ),
-]
 Temperature = Annotated[
     float | None,
     Option(
@@ -352,6 +344,32 @@ class ControllerOptions:
             )
         sizes = [DRIVE_UNITS[d.unit][1] for d in drives]
         return tuple(JointTrim(v * size) for v, size in zip(values, sizes, strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UseOptions:
+    """Options about the conditions of use.
+
+    Args:
+        approach (LETTERS): Sides from which the drives come, a letter for each: p if its coordinate
+            grew in the last motion, n if it fell, u if unknown, such as pnp; default: the middle of
+            both sides.
+    """
+
+    approach: str | None = None
+    temperature: Temperature = None
+    payload: Payload = None
+
+    def read(self, robot: orthocal.Robot) -> orthocal.UseConditions:
+        """Conditions of use.
+
+        Raises:
+            ParameterError: If a condition is out of range, or no effect of the machine depends on
+                it.
+        """
+        conditions = orthocal.UseConditions(self.approach, self.temperature, self.payload)
+        conditions.require_valid(robot, prefix="--")
+        return conditions
 
 
 def split_globs(texts: Sequence[str] | None) -> list[str]:
@@ -513,23 +531,6 @@ def read_workspace(text: str, robot: orthocal.Robot, *, where: str = "--workspac
     if problem:
         raise ParameterError(problem, where=where)
     return box
-
-
-def read_conditions(
-    robot: orthocal.Robot,
-    *,
-    approach: str | None = None,
-    temperature: float | None = None,
-    payload: float | None = None,
-) -> orthocal.UseConditions:
-    """Conditions of `--approach`, `--temperature` and `--payload`.
-
-    Raises:
-        ParameterError: If a condition is out of range, or no effect of the machine depends on it.
-    """
-    conditions = orthocal.UseConditions(approach, temperature, payload)
-    conditions.require_valid(robot, prefix="--")
-    return conditions
 
 
 def require_between(value: float, low: float, high: float, option: str) -> None:
