@@ -20,7 +20,7 @@ from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import Sensor, default_zero, tool_path
+from orthocal.sensors.protocol import Sensor, default_zero, place_point, tool_path
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import names_in_files, split_setup
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Setup
@@ -187,8 +187,7 @@ class _Positions:
         def poses(frame: str) -> Array:
             return functions.pose(frame)(drives, passive, placements)[0]
 
-        tool = poses(require_tcp(self.robot).frame)
-        ball = tool[:, :3, 3] + tool[:, :3, :3] @ np.array(bar.tool)
+        ball = place_point(poses(require_tcp(self.robot).frame), bar.tool)
         fixed = np.broadcast_to(bar.centre, ball.shape)
         clear = np.ones(len(names), dtype=np.bool_)
         for rod in self.robot.rods.values():

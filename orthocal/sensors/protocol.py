@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
+import numpy as np
 from pydantic import Field
 
 from orthocal.arguments import require_names
@@ -21,7 +22,7 @@ from orthocal.effects.protocol import Condition
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name
 from orthocal.kinematics.symbolic import Pose
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, require_tcp
 from orthocal.robot.parameters import require_prior
 from orthocal.units import InUnit, Unit
 
@@ -39,6 +40,15 @@ DIMENSION_STEP = 1e-6
 
 LARGEST_READING = 0.3
 """Largest reading of an indicator, [m]; no leg is as far from parallel."""
+
+
+Triple = tuple[float, float, float]
+
+
+def triple(values: Sequence[float] | Array, unit: float = 1.0) -> Triple:
+    """Three numbers in a unit, in SI."""
+    x, y, z = (float(v) * unit + 0.0 for v in values)
+    return x, y, z
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,6 +292,20 @@ class ToolSensor:
         """Empty mapping: no parameter is aligned by eye."""
         del robot
         return {}
+
+    def frames(self, robot: Robot) -> Frames:
+        """Frame of the tool."""
+        return Frames((require_tcp(robot).frame,))
+
+
+def place_point(poses: Array, point: Sequence[float] | Array) -> Array:
+    """Positions of a point that is fixed in a frame, shape (K, 3), [m].
+
+    Args:
+        poses: Poses of the frame, shape (K, 4, 4).
+        point: Coordinates in the frame, shape (3,), [m].
+    """
+    return np.asarray(poses[:, :3, 3] + poses[:, :3, :3] @ np.array(point))
 
 
 def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:

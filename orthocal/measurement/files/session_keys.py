@@ -13,7 +13,7 @@ from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Keys, Name, Number, PositiveNumber
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
-from orthocal.sensors.mounting import LARGEST_SCALE
+from orthocal.sensors.mounting import ScaleTolerance
 from orthocal.sensors.protocol import LARGEST_READING
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
@@ -85,7 +85,7 @@ class GaugeKeys(Keys):
     """Lowest and highest reading."""
     tip: TipKeys | None = None
     """Tip; a setup may override it."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] | None = None
+    scale_tolerance: ScaleTolerance | None = None
     """Tolerance of the scale factor, dimensionless; a setup may override it."""
 
     def to_gauge(self) -> Gauge:
