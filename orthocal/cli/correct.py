@@ -39,7 +39,7 @@ from orthocal.io.files import (
     write_file,
 )
 from orthocal.text import comment_safe, shorten
-from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
+from orthocal.units import MM, UM, format_fixed
 
 if TYPE_CHECKING:
     from orthocal.arrays import Array
@@ -495,10 +495,8 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
         backlash = result.compensated_backlash + backlash_changes(result, find_backlash(result))
     listed = []
     for drive, value in zip(result.robot.drives, backlash.tolist(), strict=True):
-        unit, factor = DRIVE_UNITS[drive.unit]
-        shown = format_fixed(value / factor, 3)
-        if float(shown):
-            listed.append(f"{drive.name} {shown} {unit}")
+        if float(format_fixed(value / drive.joint_size, 3)):
+            listed.append(f"{drive.name} {drive.show(value)}")
     if not listed:
         return ""
     if by_program and describe_trims(result.robot, result.session.compensation):
@@ -534,10 +532,8 @@ def _describe_controller(
     """Note about the offsets in the controller, [m, rad], when the program runs."""
     from orthocal.assessment.assess import assessment_of
 
-    listed = []
-    for drive, value in zip(result.robot.drives, values, strict=True):
-        unit, factor = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(float(value) / factor, 3, sign=True)} {unit}")
+    drives = zip(result.robot.drives, values, strict=True)
+    listed = [f"{drive.name} {drive.show(value, 'z+.3f')}" for drive, value in drives]
     keep = assessment_of(result).keeps_offsets
     state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:

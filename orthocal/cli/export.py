@@ -30,7 +30,7 @@ from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
 from orthocal.text import printable
-from orthocal.units import DRIVE_UNITS, MM, UM
+from orthocal.units import MM, UM
 
 if TYPE_CHECKING:
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
@@ -210,7 +210,7 @@ def _home_offsets(text: str | None, calibration: orthocal.Calibration) -> tuple[
         return None
     drives = calibration.robot.drives
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
-    return tuple(v * DRIVE_UNITS[d.unit][1] for v, d in zip(values, drives, strict=True))
+    return tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
 
 
 def _signs(text: str | None) -> tuple[int, ...] | None:

@@ -198,8 +198,6 @@ def load_stated_plan(
     Raises:
         OrthocalError: If the plan does not load, or an option is invalid.
     """
-    from orthocal.measurement.motion.approach import state_common_approach
-    from orthocal.observation.conditions import needed_conditions, schedule_readings
     from orthocal.robot.loading import packaged_robots
     from orthocal.robot.parameters import errors_at
 
@@ -212,7 +210,22 @@ def load_stated_plan(
     if effects is not None:
         with errors_at("--effects"):
             plan = plan.with_effects(split_effects(effects))
-    temperatures = read_temperatures(temperature)
+    return state_conditions(plan, read_temperatures(temperature))
+
+
+def state_conditions(
+    plan: orthocal.Session, temperatures: tuple[float, float] | None
+) -> orthocal.Session:
+    """Plan whose readings state the conditions that the effects of its machine need.
+
+    Args:
+        plan: The plan.
+        temperatures: Temperatures at the first and the last reading, [°C]; by default those of the
+            plan.
+    """
+    from orthocal.measurement.motion.approach import state_common_approach
+    from orthocal.observation.conditions import needed_conditions, schedule_readings
+
     needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
     stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
     if temperatures is not None or (needed and not stated):

@@ -324,7 +324,6 @@ class ControllerOptions:
         from orthocal.effects.compensation import JointTrim
         from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
         from orthocal.measurement.files.session_keys import LARGEST_TRIM
-        from orthocal.units import DRIVE_UNITS
 
         where, drives = "--backlash", robot.drives
         if self.ini is not None:
@@ -342,8 +341,7 @@ class ControllerOptions:
                 f"drives, or one for each of {names}",
                 where=where,
             )
-        sizes = [DRIVE_UNITS[d.unit][1] for d in drives]
-        return tuple(JointTrim(v * size) for v, size in zip(values, sizes, strict=True))
+        return tuple(JointTrim(v * d.joint_size) for v, d in zip(values, drives, strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -49,6 +49,20 @@ class Drive(InUnit):
     joint_zero: float | None = None
     """Joint coordinate of the controller at the mechanical zero, [unit]; None for `zero`."""
 
+    @property
+    def joint_unit(self) -> str:
+        """Unit in which users read coordinates: mm or deg."""
+        return DRIVE_UNITS[self.unit][0]
+
+    @property
+    def joint_size(self) -> float:
+        """Size of this unit in SI."""
+        return DRIVE_UNITS[self.unit][1]
+
+    def show(self, value: float, form: str = ".3f") -> str:
+        """Coordinate or length, [unit], as text with the unit that users read."""
+        return f"{value / self.joint_size:{form}} {self.joint_unit}"
+
     def to_joint(self, coordinate: ArrayLike) -> Array:
         """Joint coordinates of the controller from drive coordinates, any shape, [unit]."""
         return self._displayed_zero + self.direction * (
@@ -80,10 +94,11 @@ class Drive(InUnit):
 
     def describe_beyond(self, coordinate: float) -> str:
         """Description of a position, [unit], and of the limits, in joint coordinates."""
-        unit, size = DRIVE_UNITS[self.unit]
-        low, high = (v / size for v in self.joint_limits)
-        value = float(self.to_joint(coordinate)) / size
-        return f"at {value:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
+        low, high = self.joint_limits
+        value = self.show(float(self.to_joint(coordinate)), ".4g")
+        return (
+            f"at {value}, outside its limits {low / self.joint_size:g} ... {self.show(high, 'g')}"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -563,8 +578,7 @@ def drive_keys(quantity: str, drives: Sequence[Drive], values: Sequence[float]) 
     """
     texts: dict[str, list[str]] = {}
     for drive, value in zip(drives, values, strict=True):
-        unit, size = DRIVE_UNITS[drive.unit]
-        texts.setdefault(unit, []).append(f"{value / size:.6g}")
+        texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.6g}")
     return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
 
 

@@ -14,7 +14,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, parse_number
 from orthocal.io.files import read_lines
 from orthocal.robot.model import Robot
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import MM
 
 Block = tuple[list[str], Array]
 """File and line of some rows, for messages, and their values, shape (k, n_columns), [SI]."""
@@ -31,8 +31,7 @@ TOOL_COLUMNS = {"x_mm": MM, "y_mm": MM, "z_mm": MM}
 
 def drive_columns(robot: Robot) -> dict[str, float]:
     """Columns of drive coordinates and their factors to SI units."""
-    units = [DRIVE_UNITS[d.unit] for d in robot.drives]
-    return {f"{d.name}_{unit}": f for d, (unit, f) in zip(robot.drives, units, strict=True)}
+    return {f"{d.name}_{d.joint_unit}": d.joint_size for d in robot.drives}
 
 
 def read_points(path: Path, robot: Robot) -> Block:
