@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Self, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import (
@@ -24,6 +24,7 @@ from pydantic import (
     Field,
     TypeAdapter,
     ValidationError,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
@@ -76,6 +77,24 @@ class Keys(BaseModel):
     """Keys of a document; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+
+class OneKey(Keys):
+    """Keys of which exactly one is stated."""
+
+    @model_validator(mode="after")
+    def _require_one(self) -> Self:
+        """Refuse several keys, or none."""
+        stated = [key for key, value in self if value is not None]
+        if len(stated) != 1:
+            expected = ", ".join(type(self).model_fields)
+            raise ValueError(f"found {' and '.join(stated) or 'none'}; expected one of {expected}")
+        return self
+
+    @property
+    def stated(self) -> tuple[str, Any]:
+        """The stated key and its value."""
+        return next((key, value) for key, value in self if value is not None)
 
 
 Number = Annotated[

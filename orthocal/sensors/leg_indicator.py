@@ -19,15 +19,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, cast, get_args
 
 import casadi as ca
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.io.documents import Keys, Name, Number
+from orthocal.io.documents import Name, Number, OneKey
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import (
     DIRECTIONS,
@@ -77,7 +77,7 @@ LATERAL_DECIMALS = 9
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
 
-class SectionKeys(Keys):
+class SectionKeys(OneKey):
     """Section: position along the leg's nominal axis at which the gauge touches."""
 
     coordinate_mm: Number | None = None
@@ -86,16 +86,6 @@ class SectionKeys(Keys):
     """Distance from the root in the mechanical zero."""
     fraction: Number | None = None
     """Distance from the root in the mechanical zero, as a fraction of the leg length."""
-
-    @model_validator(mode="after")
-    def _require_one_form(self) -> SectionKeys:
-        """Refuse several forms, or none."""
-        forms = get_args(SectionForm)
-        stated = [k for k in forms if getattr(self, k) is not None]
-        if len(stated) != 1:
-            text = " and ".join(stated) if stated else "none"
-            raise ValueError(f"found {text}; expected one of {', '.join(forms)}")
-        return self
 
 
 class LegKeys(MountingKeys, SetupKeys):
@@ -145,9 +135,8 @@ class Section:
     @staticmethod
     def from_keys(keys: SectionKeys) -> Section:
         """Build from the keys of a session.yaml."""
-        form = next(f for f in get_args(SectionForm) if getattr(keys, f) is not None)
-        value = getattr(keys, form)
-        return Section(form, value if form == "fraction" else value * MM)
+        form, value = keys.stated
+        return Section(cast(SectionForm, form), value if form == "fraction" else value * MM)
 
     def to_keys(self) -> dict[str, float]:
         """Keys for a session.yaml."""

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
-from orthocal.io.documents import Count, Keys, Name, Number, PositiveNumber
+from orthocal.io.documents import Count, Keys, Name, Number, OneKey, PositiveNumber
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import ScaleTolerance
@@ -104,7 +104,7 @@ class GaugeKeys(Keys):
         return self
 
 
-class PostureKeys(Keys):
+class PostureKeys(OneKey):
     """Keys of a posture: commanded tool coordinates or drive coordinates."""
 
     tcp_mm: Coordinates | None = None
@@ -113,23 +113,6 @@ class PostureKeys(Keys):
     """Drive coordinates of a robot with prismatic drives, in the order of the drives."""
     joints_deg: Coordinates | None = None
     """Drive coordinates of a robot with revolute drives, in the order of the drives."""
-
-    @model_validator(mode="after")
-    def _require_one_key(self) -> PostureKeys:
-        """Refuse a posture with several keys of coordinates, or with none."""
-        stated = self.model_dump(exclude_none=True)
-        if len(stated) != 1:
-            shown = " and ".join(stated) or "none"
-            raise ValueError(
-                f"found {shown}; expected one of {', '.join(PostureKeys.model_fields)}"
-            )
-        return self
-
-    @property
-    def coordinates(self) -> tuple[str, list[float]]:
-        """Key of the posture, and its coordinates in the key's unit."""
-        ((key, values),) = self.model_dump(exclude_none=True).items()
-        return key, values
 
 
 class FirmwareKeys(Keys):

@@ -86,7 +86,7 @@ def build_postures(
 
 def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureForm, Array]:
     """Form and coordinates of a posture, shape (n_drives,), [m, rad]."""
-    key, values = keys.coordinates
+    key, values = keys.stated
     count = len(robot.drives)
     if key == "tcp_mm":
         if not robot.commands_tool:
