@@ -260,7 +260,7 @@ def csv_rows(
     *,
     name: str,
     required: tuple[str, ...],
-    optional: tuple[str, ...] = (),
+    optional: tuple[str, ...] | None = (),
     error: type[OrthocalError],
     most: int | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
@@ -272,7 +272,7 @@ def csv_rows(
         lines: Lines with their line ends.
         name: Name of the file, for messages.
         required: Required columns.
-        optional: Optional columns.
+        optional: Optional columns; None to ignore all others.
         error: Kind of error to raise.
         most: Largest number of lines.
 
@@ -292,6 +292,7 @@ def csv_rows(
         header = [composed(cell.strip()) for cell in next(reader)]
         if invalid := _header_problem(header, required, optional):
             raise error(invalid, where=f"{name}:1")
+        read = [(i, c) for i, c in enumerate(header) if optional is not None or c in required]
         for row in reader:
             line = reader.line_num
             if most is not None and line > most:
@@ -306,20 +307,20 @@ def csv_rows(
                     f"({delimiter.join(header)}){hint}",
                     where=f"{name}:{line}",
                 )
-            yield line, {c: composed(cell.strip()) for c, cell in zip(header, row, strict=True)}
+            yield line, {c: composed(row[i].strip()) for i, c in read}
     except csv.Error as e:
         raise error(f"is not valid CSV: {e}", where=f"{name}:{reader.line_num}") from None
 
 
 def _header_problem(
-    header: Sequence[str], required: Sequence[str], optional: Sequence[str]
+    header: Sequence[str], required: Sequence[str], optional: Sequence[str] | None
 ) -> str | None:
     """First problem with the columns of a CSV file; None if there is none."""
     for name in header:
-        if name not in required and name not in optional:
+        if optional is not None and name not in (*required, *optional):
             more = f" and optionally {', '.join(optional)}" if optional else ""
             return f"unknown column '{shorten(name)}'; expected {', '.join(required)}{more}"
-        if header.count(name) > 1:
+        if header.count(name) > 1 and (optional is not None or name in required):
             return f"the column '{name}' occurs twice"
     missing = next((name for name in required if name not in header), None)
     if missing is None:
