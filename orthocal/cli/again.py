@@ -16,6 +16,7 @@ from orthocal.cli.options import (
     OutDirectory,
     command,
     read_number,
+    read_pairs,
     require_between,
     split_globs,
 )
@@ -259,13 +260,9 @@ def _read_amounts(
         if not plan.adjustments or (plan.judgement != "worthwhile" and not anyway):
             raise ExportError(HEADLINES[plan.judgement], where=where)
         return plan.amounts
-    for part in [] if text is None else split_globs([text]):
-        name, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals:
-            raise ParameterError(f"found '{part}'; expected NAME=MM, or plan", where=where)
+    parts = None if text is None else split_globs([text])
+    for name, value in read_pairs(parts, where, "NAME=MM, or plan").items():
         require_adjustment(calibration.robot, name, where=where, error=ParameterError)
-        if name in amounts:
-            raise ParameterError(f"'{name}' is stated twice", where=where)
         amount = read_number(value, where, name)
         require_between(amount, -LARGEST_AMOUNT_MM, LARGEST_AMOUNT_MM, where)
         amounts[name] = amount * MM

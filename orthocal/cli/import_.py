@@ -8,11 +8,11 @@ from typing import Annotated
 from typer import Option
 
 import orthocal
-from orthocal.cli.options import Json, command
+from orthocal.cli.options import Json, command, read_pairs
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
-from orthocal.text import printable, shorten
+from orthocal.text import printable
 from orthocal.units import MM
 
 OF_TABLES = (
@@ -78,7 +78,7 @@ def import_(
         decimal=decimal,
         unit=unit,
         encoding=encoding,
-        columns=_parse_columns(column or []),
+        columns=read_pairs(column, "--column", "ROLE=HEADING"),
         fill=fill,
     )
     result = orthocal.import_readings(table, session, options, overwrite=replace)
@@ -187,17 +187,3 @@ def _import_printer(
     put_note(f"Wrote {directory}")
     if not json:
         put_out(printable(printer_commands(result, directory), keep="\n"))
-
-
-def _parse_columns(assignments: list[str]) -> dict[str, str]:
-    """Headings by role, from texts of the form ROLE=HEADING."""
-    columns: dict[str, str] = {}
-    for text in assignments:
-        role, separator, heading = text.partition("=")
-        role = role.strip()
-        if not separator or not heading.strip():
-            raise SessionError(f"found '{shorten(text)}'; expected ROLE=HEADING", where="--column")
-        if role in columns:
-            raise SessionError(f"assigns the role {shorten(role)} twice", where="--column")
-        columns[role] = heading
-    return columns

@@ -370,6 +370,28 @@ class UseOptions:
         return conditions
 
 
+def read_pairs(texts: Sequence[str] | None, option: str, form: str) -> dict[str, str]:
+    """Values by name of a repeated option NAME=VALUE.
+
+    Args:
+        texts: Values of the option.
+        option: Name of the option, for messages.
+        form: Expected form, for messages.
+
+    Raises:
+        ParameterError: If a text has another form, or a name is stated twice.
+    """
+    pairs: dict[str, str] = {}
+    for text in texts or []:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise ParameterError(f"found '{shorten(text)}'; expected {form}", where=option)
+        if name in pairs:
+            raise ParameterError(f"states {shorten(name)} twice", where=option)
+        pairs[name] = value
+    return pairs
+
+
 def split_globs(texts: Sequence[str] | None) -> list[str]:
     """Globs of repeated options, each with one or several globs separated by commas."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
