@@ -199,37 +199,24 @@ def _recorded_rows(
     )
 
 
+@dataclass(slots=True, eq=False)
 class Recording:
-    """Session that is being measured, locked against other recordings.
+    """Session that is being measured, locked against other recordings."""
 
-    Args:
-        session: The session at the start of the recording.
-        rows: Its rows in the order of measurement; NaN before they are read.
-        journal: Journal of the changes.
-        digest: Digest of the CSV on disk.
-        restored: Number of changes that a killed recording had not written to the CSV.
-        edited: Whether the CSV differs from all versions that the killed recording wrote.
-        wrong: Errors of readings out of range in the CSV, which count as missing.
-    """
-
-    def __init__(
-        self,
-        session: Session,
-        rows: Sequence[RecordedReading],
-        journal: Journal,
-        *,
-        digest: str,
-        restored: int = 0,
-        edited: bool = False,
-        wrong: Sequence[SessionError] = (),
-    ) -> None:
-        self.session = session
-        self.rows = tuple(rows)
-        self.restored = restored
-        self.edited = edited
-        self.wrong = tuple(wrong)
-        self._journal = journal
-        self._digest = digest
+    session: Session
+    """The session; its readings are those at the start of the recording."""
+    rows: tuple[RecordedReading, ...]
+    """Rows in the order of measurement; NaN before they are read."""
+    journal: Journal
+    """Journal of the changes."""
+    digest: str
+    """Digest of the CSV on disk."""
+    restored: int
+    """Number of changes that a killed recording had not written to the CSV."""
+    edited: bool
+    """Whether the CSV differs from all versions that the killed recording wrote."""
+    wrong: Sequence[SessionError]
+    """Errors of readings out of range in the CSV, which count as missing."""
 
     @property
     def path(self) -> Path:
@@ -418,7 +405,7 @@ class Recording:
     def close(self) -> None:
         """Close the journal: from now on the CSV counts."""
         with suppress(OutputError):
-            self._journal.append(CLOSED)
+            self.journal.append(CLOSED)
 
     def _apply(self, change: Change) -> None:
         """Change the rows: first in the journal, then in the CSV, then in memory."""
@@ -429,12 +416,12 @@ class Recording:
             line = change.model_dump(mode="json", exclude_none=True, by_alias=True) | {
                 "rows": [list(key) for key in change.rows],
                 "at": datetime.now(UTC).isoformat(timespec="seconds"),
-                "before": self._digest,
+                "before": self.digest,
                 "after": digest,
             }
-            self._journal.append(line)
+            self.journal.append(line)
             _write(self.path, content)
-            self.rows, self._digest = rows, digest
+            self.rows, self.digest = rows, digest
 
 
 def _conditions_to_state(row: RecordedReading, conditions: Conditions) -> Conditions | None:
@@ -510,15 +497,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             table = _table(rows, session)
             _write(csv, table)
             session = load_plan(path, wrong=wrong)
-        recording = Recording(
-            session,
-            rows,
-            journal,
-            digest=_digest(table),
-            restored=len(pending),
-            edited=edited,
-            wrong=wrong,
-        )
+        recording = Recording(session, rows, journal, _digest(table), len(pending), edited, wrong)
         try:
             yield recording
         finally:
