@@ -188,12 +188,10 @@ def _missing_controller(session: orthocal.Session) -> str:
     """Lines about keys of the controller that a session does not state; "" if it states all."""
     from orthocal.robot.model import drive_keys
 
-    drives = session.robot.drives
-    keys, zeros = [], [0.0] * len(drives)
-    if session.controller_offsets is None:
-        keys.append(drive_keys("offsets", drives, zeros))
-    if not session.compensation:
-        keys.append(drive_keys("backlash", drives, zeros))
+    drives, offsets = session.robot.drives, session.controller_offsets
+    stated = {"offsets": offsets is not None, "backlash": bool(session.compensation)}
+    zeros = [0.0] * len(drives)
+    keys = [drive_keys(key, drives, zeros) for key, is_stated in stated.items() if not is_stated]
     if not keys:
         return ""
     head = "State what the controller corrects during the measurement, one number for each drive"

@@ -239,21 +239,17 @@ def _places(
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
     """Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement."""
     if sensor.keys["sensor"] == "ball_bar":
-        yield from _bars(sensor, robot, box)
-        return
-    if sensor.keys["sensor"] == "probe":
-        yield from _beds(sensor, middle, box)
-        return
-    if sensor.keys["sensor"] == "points":
-        yield sensor.name, {}, _points(box)
-        return
+        return _bars(sensor, robot, box)
     places = {
+        "probe": _beds,
+        "points": _points,
         "square": _edges,
         "straightedge": _edges,
         "plate": _plates,
         "gauge_block": _blocks,
     }
-    yield from places[sensor.keys["artefact"]["kind"]](sensor, middle, box)
+    kind = sensor.keys.get("artefact", {}).get("kind", sensor.keys["sensor"])
+    return places[kind](sensor, middle, box)
 
 
 def _bars(
@@ -314,12 +310,16 @@ def _beds(
     yield sensor.name, {}, points
 
 
-def _points(box: Array) -> Array:
-    """Positions of a target in a box, shape (n, n_coordinates), [m]."""
+def _points(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Positions of a target in a box."""
+    del middle
     lines = [
         np.round(np.linspace(low, high, LINE_POINTS) / STEP) * STEP for low, high in box.tolist()
     ]
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
+    yield sensor.name, {}, points
 
 
 def _edges(
