@@ -222,9 +222,18 @@ class _Correction:
             describe_assumed(self.result, self.conditions, fields=CONDITIONS),
             self.backlash,
             warning,
-            _describe_uncorrected(self.interpreter.uncorrected, self.file),
-            _describe_outside(summary, self.file, self.region),
         ]
+        if (line := self.interpreter.uncorrected) is not None:
+            notes.append(
+                f"{self.file}:{line}: this rapid motion comes before the first position in X, Y "
+                "and Z and is not corrected: the tool may be off by the largest correction. "
+                "--start-mm corrects it."
+            )
+        if summary.outside is not None:
+            notes.append(
+                f"{self.file}:{summary.outside}: leaves the workspace {self.region}, over which "
+                "the correction was determined. Beyond it the correction is less certain."
+            )
         if not self.controller.work_offsets:
             notes.append("The program's coordinates are read as machine coordinates.")
         if summary.unit_assumed:
@@ -440,26 +449,6 @@ def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:
         np.array(tool.box) + tool_at_zero(result.robot)[:, None]
     )
     return region, tool.region
-
-
-def _describe_outside(summary: Summary, file: str, region: str) -> str:
-    """Note about the first line that leaves the workspace; empty if none does."""
-    if summary.outside is None:
-        return ""
-    return (
-        f"{file}:{summary.outside}: leaves the workspace {region}, over which the correction was "
-        "determined. Beyond it the correction is less certain."
-    )
-
-
-def _describe_uncorrected(line: int | None, file: str) -> str:
-    """Note about the first uncorrected rapid motion; empty if there is none."""
-    if line is None:
-        return ""
-    return (
-        f"{file}:{line}: this rapid motion comes before the first position in X, Y and Z and is "
-        "not corrected: the tool may be off by the largest correction. --start-mm corrects it."
-    )
 
 
 def _describe_tip(tip: Vector | None) -> str:

@@ -225,7 +225,7 @@ class Points(ToolSensor):
     def constants(self, robot: Robot) -> Array:
         """Coordinate axis in the world frame (3), positions of station (3) and target (3), [m]."""
         del robot
-        along = rotation_matrix(self.rotation) @ np.array(self.along or (0.0, 0.0, 0.0))
+        along = pin.exp3(np.array(self.rotation)) @ np.array(self.along or (0.0, 0.0, 0.0))
         return np.array([*along, *self.position, *self.target])
 
     @property
@@ -304,11 +304,6 @@ def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
     rotation = vh.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vh.T @ u.T))]) @ u.T
     position = targets.mean(axis=0) - rotation @ points.mean(axis=0)
     return triple(position.tolist()), triple(pin.log3(rotation).tolist())
-
-
-def rotation_matrix(vector: Sequence[float]) -> Array:
-    """Rotation matrix of a rotation vector, shape (3, 3)."""
-    return np.asarray(pin.exp3(np.array(vector)))
 
 
 def _unit(i: int) -> Triple:

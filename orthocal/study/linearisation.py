@@ -352,10 +352,11 @@ def build_linearisation_study(
 
 def _idealise(session: Session) -> Session:
     """Session with readings of 0 and exact mountings."""
-    setups = {
-        name: replace(setup, sensor=_without_mounting_errors(setup.sensor))
-        for name, setup in session.setups.items()
-    }
+    setups = dict(session.setups)
+    for name, setup in setups.items():
+        sensor: Any = setup.sensor
+        if hasattr(sensor, "mounting"):
+            setups[name] = replace(setup, sensor=replace(sensor, mounting=EXACT))
     return replace(session, setups=setups).with_values(np.zeros(len(session.readings)))
 
 
@@ -395,10 +396,6 @@ def _largest_difference(values: Array, problem: CalibrationProblem) -> Array:
         for z in np.unique(o.zero)
     ]
     return np.asarray(np.max(sizes, axis=0))
-
-
-def _without_mounting_errors(sensor: Any) -> Any:  # noqa: ANN401 - any sensor with a mounting
-    return replace(sensor, mounting=EXACT) if hasattr(sensor, "mounting") else sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -239,46 +239,29 @@ def _describe_conditions(approximation: Approximation) -> str:
     return "".join(f"\n{paragraph}" for paragraph in paragraphs)
 
 
-def _describe_undetermined(calibration: Calibration) -> str:
-    """Paragraph about drives whose backlash does not change; empty without any."""
-    return _describe_unchanged(
-        calibration,
-        "Backlash",
-        [
-            (e.drive, expanded_uncertainty(calibration, e))
-            for e in find_backlash(calibration)
-            if not e.change
-        ],
-    )
-
-
-def _describe_undetermined_screws(calibration: Calibration) -> str:
-    """Paragraph about periodic errors that are not in the tables; empty without any."""
-    screws = [e for e in find_screws(calibration) if not e.change.any()]
-    return _describe_unchanged(
-        calibration, "Periodic error of the screw", [(e.drive, e.uncertainty) for e in screws]
-    )
-
-
-def _describe_unchanged(
-    calibration: Calibration, quantity: str, uncertainties: Sequence[tuple[str, float]]
-) -> str:
-    """Paragraph about drives whose compensation does not change; empty without any.
+def _describe_unchanged(calibration: Calibration, *, module: bool = False) -> str:
+    """Paragraphs about drives whose compensation does not change; empty without any.
 
     Args:
         calibration: The calibration.
-        quantity: Compensated quantity.
-        uncertainties: Drives, and the expanded uncertainty of each, [m, rad].
+        module: Whether a module corrects the periodic errors of the screws.
     """
-    joints = {d.name: (i, d) for i, d in enumerate(calibration.robot.drives)}
-    numbered = [(*joints[name], half) for name, half in uncertainties]
-    if not numbered:
-        return ""
-    listed = ", ".join(f"JOINT_{i} (±{drive.show(half)})" for i, drive, half in numbered)
-    return (
-        f"\n**{quantity} unchanged, because its change is not determined or hardly lowers the tool "
-        f"error:** {listed}.\n"
-    )
+    backlash = [e for e in find_backlash(calibration) if not e.change]
+    screws = [e for e in find_screws(calibration) if not (module or e.change.any())]
+    uncertainties = {
+        "Backlash": [(e.drive, expanded_uncertainty(calibration, e)) for e in backlash],
+        "Periodic error of the screw": [(e.drive, e.uncertainty) for e in screws],
+    }
+    joints, paragraphs = {d.name: (i, d) for i, d in enumerate(calibration.robot.drives)}, ""
+    for quantity, of_drives in uncertainties.items():
+        numbered = [(*joints[name], half) for name, half in of_drives]
+        listed = ", ".join(f"JOINT_{i} (±{drive.show(half)})" for i, drive, half in numbered)
+        if listed:
+            paragraphs += (
+                f"\n**{quantity} unchanged, because its change is not determined or hardly lowers "
+                f"the tool error:** {listed}.\n"
+            )
+    return paragraphs
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
@@ -324,8 +307,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "table": "\n".join(rows),
         "active": f"`{_describe_offsets(calibration)}`" if stated_offsets else UNSTATED,
         "compensation": describe_compensation(homes, stated=stated)
-        + _describe_undetermined(calibration)
-        + _describe_undetermined_screws(calibration),
+        + _describe_unchanged(calibration),
     }
     return fill_template("home_offset.md", values)
 
@@ -377,7 +359,7 @@ def write_module_page(
         "nominal": nominal,
         "compensation": describe_compensation(homes, stated=stated, module=True)
         + _describe_conditions(approximation)
-        + _describe_undetermined(calibration),
+        + _describe_unchanged(calibration, module=True),
         "old_values": f" ({', '.join(old)})" if old else "",
         "last": len(homes) - 1,
         "drives": ", ".join(comment_safe(h.drive.name) for h in homes),

@@ -174,18 +174,13 @@ def _split_runs(points: Array, length: Array) -> list[slice]:
     ]
 
 
-def _count_bins(length: Array, run: slice, count: int) -> int:
-    """Number of bins of a run, with `count` bins per `LONGEST_BIN`."""
-    along = length[run]
-    return max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
-
-
 def _split_bins(length: Array, run: slice, count: int) -> list[Indices]:
     """Indices of the samples of each bin of a run, with `count` bins per `LONGEST_BIN`.
 
     Samples at rest, which do not advance along the path, are omitted.
     """
-    along, number = length[run], _count_bins(length, run, count)
+    along = length[run]
+    number = max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
     edges = along[0] + np.arange(1, number) / number * (along[-1] - along[0])
     moving = np.flatnonzero(np.diff(along, prepend=-1.0) > 0.0)
     bins = np.split(moving, np.searchsorted(along[moving], edges))
