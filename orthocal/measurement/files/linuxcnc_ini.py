@@ -63,8 +63,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     units = sections.get("TRAJ", {}).get("LINEAR_UNITS", "mm")
     if units not in METRIC_UNITS:
         raise ParameterError(f"LINEAR_UNITS is {units}; expected mm", where=f"{path}: [TRAJ]")
-    homes, latched, trims = list[float](), list[int | None](), list[JointTrim]()
-    limits = list[tuple[float, float]]()
+    joints = []
     for i, drive in enumerate(robot.drives):
         where = f"{path}: [JOINT_{i}]"
         keys = sections.get(f"JOINT_{i}")
@@ -73,16 +72,14 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
                 f"the section is missing; it belongs to drive {drive.name}", where=where
             )
         home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
-        homes.append(home)
-        limits.append(_read_limits(keys, drive, where))
-        latched.append(latch)
-        trims.append(trim)
+        joints.append((home, _read_limits(keys, drive, where), latch, trim))
+    homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
     return ControllerJoints(
-        tuple(homes),
-        tuple(limits),
+        homes,
+        limits,
         tuple(latch or 1 for latch in latched) if stated else None,
-        tuple(trims),
+        trims,
         None if stated else _read_offsets(path, robot.drives),
     )
 

@@ -14,7 +14,7 @@ from orthocal.io.documents import Count, Keys, Name, Number, OneKey, PositiveNum
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import ScaleTolerance
-from orthocal.sensors.protocol import LARGEST_READING
+from orthocal.sensors.protocol import LARGEST_READING, triple
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit
@@ -144,17 +144,12 @@ class FirmwareKeys(Keys):
         return DeltaSettings(
             self.name,
             self.radius_mm * MM,
-            _scaled(self.rods_mm, MM),
-            _scaled(self.homed_mm, MM),
-            _scaled(self.angles_deg, DEG),
+            triple(self.rods_mm, MM),
+            triple(self.homed_mm, MM),
+            triple(self.angles_deg, DEG),
             self.tilts,
-            _scaled(self.probe_mm, MM),
+            triple(self.probe_mm, MM),
         )
-
-
-def _scaled(values: Three, factor: float) -> Three:
-    a, b, c = values
-    return a * factor, b * factor, c * factor
 
 
 class ControllerKeys(Keys):
