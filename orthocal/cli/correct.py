@@ -522,7 +522,7 @@ def _describe_controller(
     from orthocal.assessment.assess import assessment_of
 
     drives = zip(result.robot.drives, values, strict=True)
-    listed = [f"{drive.name} {drive.show(value, 'z+.3f')}" for drive, value in drives]
+    listed = [f"{drive.name} {drive.show(value, '+z.3f')}" for drive, value in drives]
     keep = assessment_of(result).keeps_offsets
     state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:
