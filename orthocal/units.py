@@ -74,6 +74,21 @@ def show_limit(std: float) -> float:
     return std * LIMIT
 
 
+def read_tolerance(value: float, unit: float = 1.0) -> float:
+    """Prior standard deviation, [SI], of a tolerance that a file states.
+
+    Args:
+        value: The tolerance.
+        unit: Its unit in SI.
+    """
+    return tidy(read_limit(value) * unit)
+
+
+def show_tolerance(std: float, unit: float = 1.0) -> float:
+    """Tolerance in a unit for a file; inverse of `read_tolerance`."""
+    return tidy(show_limit(std) / unit)
+
+
 def to_mm(value: float) -> float:
     """A length in mm, rounded to 12 significant digits."""
     return tidy(value / MM)

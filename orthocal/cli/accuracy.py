@@ -14,14 +14,11 @@ import orthocal
 from orthocal.cli.forward import put_assumed
 from orthocal.cli.options import (
     Anyway,
-    Approach,
     CalibrationPath,
     HalfSideMm,
     Json,
-    Payload,
-    Temperature,
+    UseOptions,
     command,
-    read_conditions,
     require_between,
 )
 from orthocal.cli.printing import deliver, print_rows, put_note
@@ -29,7 +26,7 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.cli.options import Array
+    from orthocal.arrays import Array
 
 
 @command()
@@ -37,9 +34,8 @@ def accuracy(
     calibration: CalibrationPath,
     points: Annotated[Path | None, Argument()] = None,
     half_side_mm: HalfSideMm = None,
-    approach: Approach = None,
-    temperature: Temperature = None,
-    payload: Payload = None,
+    *,
+    use: UseOptions,
     json: Json = False,
     anyway: Anyway = False,
 ) -> None:
@@ -70,9 +66,7 @@ def accuracy(
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
-    conditions = read_conditions(
-        result.robot, approach=approach, temperature=temperature, payload=payload
-    )
+    conditions = use.read(result.robot)
     names, workspace = None, None
     if points is not None:
         names, targets = read_points(points, result.robot)

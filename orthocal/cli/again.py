@@ -16,6 +16,7 @@ from orthocal.cli.options import (
     OutDirectory,
     command,
     read_number,
+    read_pairs,
     require_between,
     split_globs,
 )
@@ -81,8 +82,7 @@ def again(
         new = replace(new, compensation=joints.compensation)
     new = replace(new, offsets_from=calibration)
     _write(new, out, f"orthocal validate {quote_path(os.path.relpath(calibration, out))} .")
-    if order := note_wrong_order(result):
-        put_note(order)
+    put_note(note_wrong_order(result))
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
@@ -109,8 +109,7 @@ def _write(new: orthocal.Session, out: Path, validating: str) -> None:
         f"readings.csv. Compare the readings with the calibration:\n{validating}"
     )
     sheet, problem = sheet_or_problem(new, following=validating)
-    if problem:
-        put_note(problem)
+    put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
 
 
@@ -151,15 +150,15 @@ def _note_other_lines(
                 "and the file joints.ini of the export."
             )
         return
-    differences = describe_other_lines(
-        calibration,
-        joints.compensation,
-        joints.offsets,
-        entered=new.active_offsets,
-        file=str(ini),
+    put_note(
+        describe_other_lines(
+            calibration,
+            joints.compensation,
+            joints.offsets,
+            entered=new.active_offsets,
+            file=str(ini),
+        )
     )
-    if differences:
-        put_note(differences)
 
 
 def _describe_entries(
@@ -274,13 +273,9 @@ def _read_amounts(
         if not plan.adjustments or (plan.judgement != "worthwhile" and not anyway):
             raise ExportError(HEADLINES[plan.judgement], where=where)
         return plan.amounts
-    for part in [] if text is None else split_globs([text]):
-        name, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals:
-            raise ParameterError(f"found '{part}'; expected NAME=MM, or plan", where=where)
+    parts = None if text is None else split_globs([text])
+    for name, value in read_pairs(parts, where, "NAME=MM, or plan").items():
         require_adjustment(calibration.robot, name, where=where, error=ParameterError)
-        if name in amounts:
-            raise ParameterError(f"'{name}' is stated twice", where=where)
         amount = read_number(value, where, name)
         require_between(amount, -LARGEST_AMOUNT_MM, LARGEST_AMOUNT_MM, where)
         amounts[name] = amount * MM

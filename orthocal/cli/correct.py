@@ -27,7 +27,6 @@ from orthocal.cli.options import (
     Temperature,
     ToolTip,
     command,
-    read_conditions,
     read_vector,
 )
 from orthocal.cli.overwriting import require_replaceable_file
@@ -40,21 +39,16 @@ from orthocal.io.files import (
     write_file,
 )
 from orthocal.text import comment_safe, shorten
-from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
+from orthocal.units import MM, UM, format_fixed
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from orthocal.export.approach_sides import ApproachSides
+    from orthocal.arrays import Array
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import ProgramCorrector, Summary
     from orthocal.kinematics.conditions import UseCondition
     from orthocal.kinematics.workspace import Workspace
-
-    Array = NDArray[np.float64]
 
 MARK = "Corrected by orthocal"
 """Beginning of the comment that marks a corrected program."""
@@ -195,10 +189,8 @@ class _Correction:
     field: CorrectionField
     tolerance: float
     """Largest distance of the written path from the corrected path, [m]."""
-    lags: Array
-    """Half of the backlash to be compensated, shape (n_drives,), [m, rad]."""
-    sides: ApproachSides | None
-    """Sides of approach; None if the controller compensates the backlash, or there is none."""
+    backlash: str
+    """Description of the compensation of the backlash; empty if there is none."""
     interpreter: Interpreter
     corrector: ProgramCorrector
     region: str
@@ -212,13 +204,10 @@ class _Correction:
 
         return [
             self.for_controller,
-            self._describe_backlash(),
+            self.backlash,
             describe_conditions_of(self.result, self.conditions, fields=CONDITIONS),
             _describe_tip(self.controller.tip),
         ]
-
-    def _describe_backlash(self) -> str:
-        return _describe_backlash(self.result, self.lags, by_program=self.sides is not None)
 
     def list_notes(self, warning: str) -> list[str]:
         """Notes about the corrected program; empty ones do not apply."""
@@ -232,11 +221,20 @@ class _Correction:
             note_wrong_order(self.result),
             _describe_tip(self.controller.tip) or _describe_tools(tools),
             describe_assumed(self.result, self.conditions, fields=CONDITIONS),
-            self._describe_backlash(),
+            self.backlash,
             warning,
-            _describe_uncorrected(self.interpreter.uncorrected, self.file),
-            _describe_outside(summary, self.file, self.region),
         ]
+        if (line := self.interpreter.uncorrected) is not None:
+            notes.append(
+                f"{self.file}:{line}: this rapid motion comes before the first position in X, Y "
+                "and Z and is not corrected: the tool may be off by the largest correction. "
+                "--start-mm corrects it."
+            )
+        if summary.outside is not None:
+            notes.append(
+                f"{self.file}:{summary.outside}: leaves the workspace {self.region}, over which "
+                "the correction was determined. Beyond it the correction is less certain."
+            )
         if not self.controller.work_offsets:
             notes.append("The program's coordinates are read as machine coordinates.")
         if self.region:
@@ -263,9 +261,8 @@ def _prepare(
     active, tip = options.offsets is Offsets.ACTIVE, controller.tip
     values = result.active_offsets if active else offsets_to_enter(result)
     tolerance = options.within * UM
-    conditions = read_conditions(
-        result.robot, temperature=options.temperature, payload=options.payload
-    )
+    conditions = orthocal.UseConditions(None, options.temperature, options.payload)
+    conditions.require_valid(result.robot, prefix="--")
     field = CorrectionField(
         result,
         values,
@@ -293,8 +290,7 @@ def _prepare(
         conditions=conditions,
         field=field,
         tolerance=tolerance,
-        lags=lags,
-        sides=sides,
+        backlash=_describe_backlash(result, lags, by_program=by_program),
         interpreter=interpreter,
         corrector=ProgramCorrector(
             interpreter, field, within=tolerance, region=region, sides=sides
@@ -472,26 +468,6 @@ def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:
     return region, tool.region
 
 
-def _describe_outside(summary: Summary, file: str, region: str) -> str:
-    """Note about the first line that leaves the workspace; empty if none does."""
-    if summary.outside is None:
-        return ""
-    return (
-        f"{file}:{summary.outside}: leaves the workspace {region}, over which the correction was "
-        "determined. Beyond it the correction is less certain."
-    )
-
-
-def _describe_uncorrected(line: int | None, file: str) -> str:
-    """Note about the first uncorrected rapid motion; empty if there is none."""
-    if line is None:
-        return ""
-    return (
-        f"{file}:{line}: this rapid motion comes before the first position in X, Y and Z and is "
-        "not corrected: the tool may be off by the largest correction. --start-mm corrects it."
-    )
-
-
 def _describe_tip(tip: Vector | None) -> str:
     """Note about the stated tip; empty if there is none."""
     if tip is None:
@@ -525,10 +501,8 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
         backlash = result.compensated_backlash + backlash_changes(result, find_backlash(result))
     listed = []
     for drive, value in zip(result.robot.drives, backlash.tolist(), strict=True):
-        unit, factor = DRIVE_UNITS[drive.unit]
-        shown = format_fixed(value / factor, 3)
-        if float(shown):
-            listed.append(f"{drive.name} {shown} {unit}")
+        if float(format_fixed(value / drive.joint_size, 3)):
+            listed.append(f"{drive.name} {drive.show(value)}")
     if not listed:
         return ""
     if by_program and describe_trims(result.robot, result.session.compensation):
@@ -564,10 +538,8 @@ def _describe_controller(
     """Note about the offsets in the controller, [m, rad], when the program runs."""
     from orthocal.assessment.assess import assessment_of
 
-    listed = []
-    for drive, value in zip(result.robot.drives, values, strict=True):
-        unit, factor = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(float(value) / factor, 3, sign=True)} {unit}")
+    drives = zip(result.robot.drives, values, strict=True)
+    listed = [f"{drive.name} {drive.show(value, '+z.3f')}" for drive, value in drives]
     keep = assessment_of(result).keeps_offsets
     state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:

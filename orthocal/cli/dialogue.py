@@ -16,7 +16,7 @@ from orthocal.errors import ParameterError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.cli.options import Array
+    from orthocal.arrays import Array
 
 Answer = TypeVar("Answer")
 
@@ -281,7 +281,7 @@ def _ask_until_valid(question: str, option: str, read: Callable[[str], Answer]) 
         sys.stderr.flush()
         text = sys.stdin.readline()
         if not text:
-            put_note("")
+            sys.stderr.write("\n")
             raise ParameterError("was not answered: the input ended", where=option)
         try:
             return read(text.strip())

@@ -30,7 +30,7 @@ from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
 from orthocal.text import printable
-from orthocal.units import DRIVE_UNITS, MM, UM
+from orthocal.units import MM, UM
 
 if TYPE_CHECKING:
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
@@ -75,6 +75,8 @@ def export(
             for drives with backlash. Default: + for all joints.
         ini (FILE): linuxcnc: INI file during the measurement: HOME_OFFSET, latching, soft limits.
     """
+    from orthocal.export.formats import note_wrong_order
+
     result = orthocal.load_calibration(calibration)
     stated = {"--home-offset": home_offset, "--latched": latched}
     joints = None if ini is None else _read_joints(ini, result, stated)
@@ -96,7 +98,7 @@ def export(
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
-        _note_order(result)
+        put_note(note_wrong_order(result))
         _note_latching(result, options, ini, module="kinematics.ini" in files)
     if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
@@ -124,14 +126,6 @@ def _show_settings(
             put_out(printable(describe_next(fit, saved, out), keep="\n"))
 
 
-def _note_order(calibration: orthocal.Calibration) -> None:
-    """Note that the present offsets may be those of an earlier session."""
-    from orthocal.export.formats import note_wrong_order
-
-    if order := note_wrong_order(calibration):
-        put_note(order)
-
-
 def _note_latching(
     calibration: orthocal.Calibration,
     options: orthocal.ExportOptions,
@@ -157,9 +151,7 @@ def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> N
     from orthocal.output.text.conditions import describe_assumed
 
     conditions = orthocal.UseConditions(payload=payload)
-    assumed = describe_assumed(calibration, conditions, fields=["payload"])
-    if assumed:
-        put_note(assumed)
+    put_note(describe_assumed(calibration, conditions, fields=["payload"]))
 
 
 def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
@@ -218,7 +210,7 @@ def _home_offsets(text: str | None, calibration: orthocal.Calibration) -> tuple[
         return None
     drives = calibration.robot.drives
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
-    return tuple(v * DRIVE_UNITS[d.unit][1] for v, d in zip(values, drives, strict=True))
+    return tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
 
 
 def _signs(text: str | None) -> tuple[int, ...] | None:

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import state_tolerances
-from orthocal.errors import SessionError
+from orthocal.cli.options import read_temperatures, split_effects, state_tolerances
+from orthocal.errors import ParameterError, SessionError
+from orthocal.io.files import exists
 from orthocal.text import spans
 
 ROUNDING = 1e-9
@@ -182,6 +183,34 @@ def _are_copied(
         return False
     sigma, step = min(steps, key=lambda s: s[0] / s[1])
     return chance_of_equal_readings(n_equal, count, sigma=sigma, step=step) < COPY_CHANCE
+
+
+def load_stated_plan(
+    path: Path, *, effects: str | None, temperature: str | None
+) -> orthocal.Session:
+    """Plan with stated effects, whose readings state the conditions that these effects need.
+
+    Args:
+        path: Path of its session.
+        effects: Value of `--effects`; by default the effects of the plan.
+        temperature: Value of `--temperature`; by default the temperatures of the plan.
+
+    Raises:
+        OrthocalError: If the plan does not load, or an option is invalid.
+    """
+    from orthocal.robot.loading import packaged_robots
+    from orthocal.robot.parameters import errors_at
+
+    if not exists(path) and str(path) in packaged_robots():
+        raise ParameterError(
+            f"is a robot; expected a session.yaml, which `orthocal plan {path} --out ...` writes",
+            where=str(path),
+        )
+    plan = orthocal.load_plan(path)
+    if effects is not None:
+        with errors_at("--effects"):
+            plan = plan.with_effects(split_effects(effects))
+    return state_conditions(plan, read_temperatures(temperature))
 
 
 def state_conditions(

@@ -9,14 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orthocal
-from orthocal.cli.options import (
-    Approach,
-    CalibrationPath,
-    Payload,
-    Temperature,
-    command,
-    read_conditions,
-)
+from orthocal.cli.options import CalibrationPath, UseOptions, command
 from orthocal.cli.printing import print_rows, put_note
 from orthocal.errors import SessionError
 
@@ -26,13 +19,7 @@ if TYPE_CHECKING:
 
 
 @command()
-def forward(
-    calibration: CalibrationPath,
-    joints: Path,
-    approach: Approach = None,
-    temperature: Temperature = None,
-    payload: Payload = None,
-) -> None:
+def forward(calibration: CalibrationPath, joints: Path, *, use: UseOptions) -> None:
     """Print tool positions for drive coordinates, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can
@@ -47,9 +34,7 @@ def forward(
     from orthocal.measurement.files.coordinate_tables import TOOL_COLUMNS, stream_joints
 
     result = orthocal.load_calibration(calibration)
-    conditions = read_conditions(
-        result.robot, approach=approach, temperature=temperature, payload=payload
-    )
+    conditions = use.read(result.robot)
     transform = partial(forward_blocks, conditions=conditions)
     print_transformed(result, joints, stream_joints, transform, TOOL_COLUMNS, conditions)
 
@@ -93,5 +78,4 @@ def put_assumed(calibration: orthocal.Calibration, conditions: orthocal.UseCondi
     """Note the assumed conditions and their effect on the tool error, if there is one."""
     from orthocal.output.text.conditions import describe_assumed
 
-    if note := describe_assumed(calibration, conditions):
-        put_note(note)
+    put_note(describe_assumed(calibration, conditions))

@@ -8,11 +8,11 @@ from typing import Annotated
 from typer import Option
 
 import orthocal
-from orthocal.cli.options import Json, command
+from orthocal.cli.options import Json, command, read_pairs
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
-from orthocal.text import printable, shorten
+from orthocal.text import printable
 from orthocal.units import MM
 
 OF_TABLES = (
@@ -67,7 +67,9 @@ def import_(
         settings (FILE): Settings that a log lacks, such as printer.cfg, config.g or bed.g.
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
-    if format or settings or radius_mm is not None or _is_printer_log(table):
+    from orthocal.measurement.importing.printer_log import recognise_log
+
+    if format or settings or radius_mm is not None or recognise_log(table) is not None:
         _refuse_options(sheet, decimal, separator, unit, encoding, column, fill, replace)
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
@@ -78,7 +80,7 @@ def import_(
         decimal=decimal,
         unit=unit,
         encoding=encoding,
-        columns=_parse_columns(column or []),
+        columns=read_pairs(column, "--column", "ROLE=HEADING"),
         fill=fill,
     )
     result = orthocal.import_readings(table, session, options, overwrite=replace)
@@ -114,13 +116,6 @@ def _refuse_options(*values: object) -> None:
     for name, value in zip(OF_TABLES, values, strict=True):
         if value:
             raise SessionError("is for tables; found the log of a printer", where=name)
-
-
-def _is_printer_log(table: Path) -> bool:
-    """True if the file is clearly a printer's log."""
-    from orthocal.measurement.importing.printer_log import recognise_log
-
-    return recognise_log(table) is not None
 
 
 def _session_file(session: Path) -> Path:
@@ -187,17 +182,3 @@ def _import_printer(
     put_note(f"Wrote {directory}")
     if not json:
         put_out(printable(printer_commands(result, directory), keep="\n"))
-
-
-def _parse_columns(assignments: list[str]) -> dict[str, str]:
-    """Headings by role, from texts of the form ROLE=HEADING."""
-    columns: dict[str, str] = {}
-    for text in assignments:
-        role, separator, heading = text.partition("=")
-        role = role.strip()
-        if not separator or not heading.strip():
-            raise SessionError(f"found '{shorten(text)}'; expected ROLE=HEADING", where="--column")
-        if role in columns:
-            raise SessionError(f"assigns the role {shorten(role)} twice", where="--column")
-        columns[role] = heading
-    return columns

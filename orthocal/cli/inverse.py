@@ -7,24 +7,11 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.forward import print_transformed
-from orthocal.cli.options import (
-    Approach,
-    CalibrationPath,
-    Payload,
-    Temperature,
-    command,
-    read_conditions,
-)
+from orthocal.cli.options import CalibrationPath, UseOptions, command
 
 
 @command()
-def inverse(
-    calibration: CalibrationPath,
-    targets: Path,
-    approach: Approach = None,
-    temperature: Temperature = None,
-    payload: Payload = None,
-) -> None:
+def inverse(calibration: CalibrationPath, targets: Path, *, use: UseOptions) -> None:
     """Print drive coordinates for tool positions, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can
@@ -39,8 +26,6 @@ def inverse(
     from orthocal.measurement.files.coordinate_tables import drive_columns, stream_points
 
     result = orthocal.load_calibration(calibration)
-    conditions = read_conditions(
-        result.robot, approach=approach, temperature=temperature, payload=payload
-    )
+    conditions = use.read(result.robot)
     columns, transform = drive_columns(result.robot), partial(inverse_blocks, conditions=conditions)
     print_transformed(result, targets, stream_points, transform, columns, conditions)

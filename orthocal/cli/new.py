@@ -23,6 +23,7 @@ from orthocal.cli.options import (
     Tolerances,
     WorkspaceMm,
     command,
+    read_pairs,
     read_temperatures,
     read_tolerances,
     read_workspace,
@@ -115,12 +116,8 @@ class DimensionOptions:
             text = getattr(self, key)
             if text is not None:
                 stated[key] = Stated(option, text)
-        for text in self.dimension or []:
-            key, equal, value = (part.strip() for part in text.partition("="))
-            if not equal or not key:
-                raise ParameterError(
-                    f"found '{text}'; expected KEY=VALUE, such as rod_mm=280", where="--dimension"
-                )
+        form = "KEY=VALUE, such as rod_mm=280"
+        for key, value in read_pairs(self.dimension, "--dimension", form).items():
             if key in stated:
                 raise ParameterError(f"states {key} twice", where="--dimension")
             stated[key] = Stated(f"--dimension {key}", value)
@@ -209,8 +206,7 @@ def new(
     _write(folder, name, design)
     _report(folder, design)
     note_beyond_limits(design.session, controller.ini)
-    if design.assumed_tip:
-        put_note(design.assumed_tip)
+    put_note(design.assumed_tip)
     if not design.tolerance_stated:
         put_note(
             f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "

@@ -20,12 +20,8 @@ from orthocal.text import shorten
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from orthocal.arrays import Array
     from orthocal.effects.compensation import Compensation
-
-    Array = NDArray[np.float64]
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -276,14 +272,6 @@ ToolTip = Annotated[
         help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
     ),
 ]
-Approach = Annotated[
-    str | None,
-    Option(
-        metavar="LETTERS",
-        help="Sides from which the drives come, a letter for each: p if its coordinate grew in the "
-        "last motion, n if it fell, u if unknown, such as pnp; default: the middle of both sides.",
-    ),
-]
 Temperature = Annotated[
     float | None,
     Option(
@@ -336,7 +324,6 @@ class ControllerOptions:
         from orthocal.effects.compensation import JointTrim
         from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
         from orthocal.measurement.files.session_keys import LARGEST_TRIM
-        from orthocal.units import DRIVE_UNITS
 
         where, drives = "--backlash", robot.drives
         if self.ini is not None:
@@ -354,8 +341,55 @@ class ControllerOptions:
                 f"drives, or one for each of {names}",
                 where=where,
             )
-        sizes = [DRIVE_UNITS[d.unit][1] for d in drives]
-        return tuple(JointTrim(v * size) for v, size in zip(values, sizes, strict=True))
+        return tuple(JointTrim(v * d.joint_size) for v, d in zip(values, drives, strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UseOptions:
+    """Options about the conditions of use.
+
+    Args:
+        approach (LETTERS): Sides from which the drives come, a letter for each: p if its coordinate
+            grew in the last motion, n if it fell, u if unknown, such as pnp; default: the middle of
+            both sides.
+    """
+
+    approach: str | None = None
+    temperature: Temperature = None
+    payload: Payload = None
+
+    def read(self, robot: orthocal.Robot) -> orthocal.UseConditions:
+        """Conditions of use.
+
+        Raises:
+            ParameterError: If a condition is out of range, or no effect of the machine depends on
+                it.
+        """
+        conditions = orthocal.UseConditions(self.approach, self.temperature, self.payload)
+        conditions.require_valid(robot, prefix="--")
+        return conditions
+
+
+def read_pairs(texts: Sequence[str] | None, option: str, form: str) -> dict[str, str]:
+    """Values by name of a repeated option NAME=VALUE.
+
+    Args:
+        texts: Values of the option.
+        option: Name of the option, for messages.
+        form: Expected form, for messages.
+
+    Raises:
+        ParameterError: If a text has another form, or a name is stated twice.
+    """
+    pairs: dict[str, str] = {}
+    for text in texts or []:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise ParameterError(f"found '{shorten(text)}'; expected {form}", where=option)
+        if name in pairs:
+            raise ParameterError(f"states {shorten(name)} twice", where=option)
+        pairs[name] = value
+    return pairs
 
 
 def split_globs(texts: Sequence[str] | None) -> list[str]:
@@ -517,23 +551,6 @@ def read_workspace(text: str, robot: orthocal.Robot, *, where: str = "--workspac
     if problem:
         raise ParameterError(problem, where=where)
     return box
-
-
-def read_conditions(
-    robot: orthocal.Robot,
-    *,
-    approach: str | None = None,
-    temperature: float | None = None,
-    payload: float | None = None,
-) -> orthocal.UseConditions:
-    """Conditions of `--approach`, `--temperature` and `--payload`.
-
-    Raises:
-        ParameterError: If a condition is out of range, or no effect of the machine depends on it.
-    """
-    conditions = orthocal.UseConditions(approach, temperature, payload)
-    conditions.require_valid(robot, prefix="--")
-    return conditions
 
 
 def require_between(value: float, low: float, high: float, option: str) -> None:

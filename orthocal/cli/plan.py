@@ -123,8 +123,7 @@ def plan(
     workers = options.workers or available_cores()
     chosen = _choose(subject, options, controller, workers=workers)
     deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
-    if assumed := describe_assumed_tip(chosen.equipment, chosen.session):
-        put_note(assumed)
+    put_note(describe_assumed_tip(chosen.equipment, chosen.session))
     if out is not None:
         sessions = [Path(subject), out] if chosen.complements_session else [out]
         stated = options.tolerance and chosen.complements_session
@@ -189,12 +188,10 @@ def _missing_controller(session: orthocal.Session) -> str:
     """Lines about keys of the controller that a session does not state; "" if it states all."""
     from orthocal.robot.model import drive_keys
 
-    drives = session.robot.drives
-    keys, zeros = [], [0.0] * len(drives)
-    if session.controller_offsets is None:
-        keys.append(drive_keys("offsets", drives, zeros))
-    if not session.compensation:
-        keys.append(drive_keys("backlash", drives, zeros))
+    drives, offsets = session.robot.drives, session.controller_offsets
+    stated = {"offsets": offsets is not None, "backlash": bool(session.compensation)}
+    zeros = [0.0] * len(drives)
+    keys = [drive_keys(key, drives, zeros) for key, is_stated in stated.items() if not is_stated]
     if not keys:
         return ""
     head = "State what the controller corrects during the measurement, one number for each drive"
@@ -230,8 +227,7 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path, calibrating: str) -> N
         [lambda: sheet_or_problem(plan.session, following=calibrating), lambda: draw_plan(plan)],
         killed="a process that drew the plan was killed",
     )
-    if problem:
-        put_note(problem)
+    put_note(problem)
     files = {"plan.json": plan_json(plan), "plan.svg": figure, **sheet}
     path = orthocal.write_session(plan.session, directory, comment=comment, extra=files, blank=True)
     sheet_names = ", sheet.html and its programs" if sheet else ""

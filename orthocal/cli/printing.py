@@ -34,8 +34,9 @@ def put_part(text: str) -> None:
 
 
 def put_note(text: str) -> None:
-    """Print a note on stderr."""
-    sys.stderr.write(printable(text, keep="\n") + "\n")
+    """Print a note on stderr; an empty one does not apply."""
+    if text:
+        sys.stderr.write(printable(text, keep="\n") + "\n")
 
 
 def deliver(

@@ -110,5 +110,4 @@ def note_beyond_limits(session: orthocal.Session, ini: Path | None) -> None:
         return
     limits = read_controller_joints(ini, session.robot).limits
     with suppress(SessionError):  # no measuring sheet, whose reason is printed
-        if text := describe_beyond_limits(session, limits, file=str(ini)):
-            put_note(text)
+        put_note(describe_beyond_limits(session, limits, file=str(ini)))

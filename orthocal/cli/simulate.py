@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.files import state_conditions
+from orthocal.cli.files import load_stated_plan
 from orthocal.cli.options import (
     Error,
     Errors,
@@ -17,8 +17,6 @@ from orthocal.cli.options import (
     TemperatureRange,
     Tolerances,
     command,
-    read_temperatures,
-    split_effects,
     state_tolerances,
 )
 from orthocal.cli.overwriting import require_new_session
@@ -58,14 +56,9 @@ def simulate(
     """
     from orthocal.observation.sensor_groups import nuisance_parameters
     from orthocal.observation.simulate import collect_errors, drawn_gauge_errors, truth_document
-    from orthocal.robot.parameters import errors_at
 
     require_new_session(out, FILES, force=force)
-    planned = orthocal.load_plan(plan)
-    if effects is not None:
-        with errors_at("--effects"):
-            planned = planned.with_effects(split_effects(effects))
-    planned = state_conditions(planned, read_temperatures(temperature))
+    planned = load_stated_plan(plan, effects=effects, temperature=temperature)
     planned = state_tolerances(planned, tolerance)
     true_errors = collect_errors(
         planned.robot,

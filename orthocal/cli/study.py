@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 import orthocal
-from orthocal.cli.files import state_conditions
+from orthocal.cli.files import load_stated_plan
 from orthocal.cli.options import (
     LARGEST_MM,
     AllRows,
@@ -36,7 +36,6 @@ from orthocal.cli.options import (
     load_robot_or_session,
     make_group,
     read_numbers,
-    read_temperatures,
     read_tolerances,
     read_workspace,
     require_between,
@@ -45,7 +44,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.printing import deliver, put_note
 from orthocal.errors import ParameterError
-from orthocal.io.files import Content, exists, require_writable
+from orthocal.io.files import Content, require_writable
 from orthocal.units import MM
 
 if TYPE_CHECKING:
@@ -122,7 +121,7 @@ def accuracy(
     """
     from orthocal.observation.simulate import collect_errors
 
-    session = _load_plan(plan, effects, temperature)
+    session = load_stated_plan(plan, effects=effects, temperature=temperature)
     robot, machine_effects = session.robot, session.robot.effect_names
     fixed = {}
     if error or errors is not None:
@@ -146,27 +145,6 @@ def accuracy(
         half_side=None if half_side_mm is None else half_side_mm * MM,
     )
     _run(study, run)
-
-
-def _load_plan(plan: Path, effects: str | None, temperature: str | None) -> orthocal.Session:
-    """Plan with the stated effects and conditions.
-
-    Raises:
-        OrthocalError: If the plan does not load, or an option is invalid.
-    """
-    from orthocal.robot.loading import packaged_robots
-    from orthocal.robot.parameters import errors_at
-
-    if not exists(plan) and str(plan) in packaged_robots():
-        raise ParameterError(
-            f"is a robot; expected a session.yaml, which `orthocal plan {plan} --out ...` writes",
-            where=str(plan),
-        )
-    session = orthocal.load_plan(plan)
-    if effects is not None:
-        with errors_at("--effects"):
-            session = session.with_effects(split_effects(effects))
-    return state_conditions(session, read_temperatures(temperature))
 
 
 def _without(effects: Sequence[str], ignored: str) -> list[str]:

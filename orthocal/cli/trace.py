@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from typer import Argument
 
 import orthocal
-from orthocal.cli.options import Force, OutDirectory, PlanPath, command
+from orthocal.cli.options import Force, OutDirectory, PlanPath, command, read_pairs
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
-from orthocal.errors import SessionError
-from orthocal.text import shorten
 
 FILES = ("session.yaml", "readings.csv")
 
@@ -41,7 +38,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
 
     require_new_session(out, FILES, force=force)
     plan = load_plan(session)
-    files = _split(traces)
+    files = read_pairs(traces, "traces", "SETUP=FILE")
     by_setup = {name: read_trace(path, plan.robot) for name, path in files.items()}
     binned = bin_traces(plan, by_setup)
     averaged = with_traces(plan, binned)
@@ -59,16 +56,3 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
             f"({counted(in_bins, 'sample')}) {'was' if unused == 1 else 'were'} not used: a bin "
             f"needs {FEWEST_SAMPLES} samples at different positions"
         )
-
-
-def _split(traces: list[str]) -> dict[str, Path]:
-    """Files by setup, from texts of the form SETUP=FILE."""
-    files: dict[str, Path] = {}
-    for text in traces:
-        setup, _, file = text.partition("=")
-        if not (setup and file):
-            raise SessionError(f"found '{shorten(text)}'; expected SETUP=FILE", where="traces")
-        if setup in files:
-            raise SessionError(f"has two traces: '{setup}'", where="traces")
-        files[setup] = Path(file)
-    return files

@@ -20,7 +20,6 @@ from orthocal.effects.loading import robot_effects
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, Matrix
 from orthocal.robot.model import Drive, Robot
-from orthocal.units import DRIVE_UNITS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,11 +116,10 @@ def describe_trims(robot: Robot, trims: Sequence[JointTrim]) -> str:
     """Description of the compensation of each drive; "" if there is none."""
     texts = []
     for drive, trim in zip(robot.drives, trims, strict=False):
-        unit, size = DRIVE_UNITS[drive.unit]
         if trim.table is not None:
             texts.append(f"{drive.name} by a table")
         elif trim.backlash:
-            texts.append(f"{drive.name} {trim.backlash / size:.3f} {unit}")
+            texts.append(f"{drive.name} {drive.show(trim.backlash)}")
     return ", ".join(texts)
 
 
@@ -134,5 +132,5 @@ def format_table(trim: JointTrim, drive: Drive) -> str:
     """Text of a table in mm or degrees: position, trim after it grew, trim after it fell."""
     if trim.table is None:
         return ""
-    size = DRIVE_UNITS[drive.unit][1]
-    return "".join(" ".join(f"{v / size:.6f}" for v in row) + "\n" for row in trim.table)
+    rows = trim.table / drive.joint_size
+    return "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in rows)

@@ -120,8 +120,6 @@ class CorrectionField:
         self.bound = POLYNOMIAL_TOLERANCE * within
         """Largest error of a point, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
-        self._displacement = calibration.displacement
-        self._nominal = nominal_closure(robot)
         self._rotation, self._translation = np.eye(3), np.zeros(3)
         if aligned_over is not None:
             self._rotation, self._translation = self._align(aligned_over)
@@ -179,28 +177,8 @@ class CorrectionField:
         return corrected, refused
 
     def exactly(self, points: Array) -> tuple[Array, Mapping[int, str]]:
-        """Exact points to command, and refused points with the reasons.
-
-        Args:
-            points: Desired coordinates that the drives command, shape (k, n_axes), [m].
-        """
-        corrected = np.full(points.shape, np.nan)
-        refused: dict[int, str] = {}
-        for first in range(0, len(points), BATCH_SIZE):
-            batch = points[first : first + BATCH_SIZE]
-            failures: Failures = {}
-            motors = self._tip.reach(self._move(batch), failures=failures)[0] + self._offsets
-            drives = motors - self._displacement(motors)
-            drives = motors - self._displacement(drives)
-            reached = np.array([i for i in range(len(batch)) if i not in failures], dtype=np.int64)
-            nominal_failures: Failures = {}
-            commanded = self._nominal.forward(drives[reached], failures=nominal_failures)
-            corrected[first + reached] = commanded[:, list(self.axes)]
-            failures.update({int(reached[i]): e for i, e in nominal_failures.items()})
-            for i, e in failures.items():
-                refused[first + i] = e.reason
-                corrected[first + i] = np.nan
-        return corrected, refused
+        """Exact points to command, and refused points with the reasons; see `command_points`."""
+        return command_points(self._tip, self._offsets, self._move(points))
 
     def _align(self, workspace: Workspace) -> tuple[Array, Array]:
         """Rotation and translation that best map commanded points to uncorrected tips.
@@ -210,8 +188,9 @@ class CorrectionField:
         """
         from scipy.spatial.transform import Rotation
 
-        drives = self._nominal.inverse(workspace.points)
-        motors = drives + self._displacement(drives)
+        calibration = self._tip.calibration
+        drives = nominal_closure(calibration.robot).inverse(workspace.points)
+        motors = drives + calibration.displacement(drives)
         desired, actual = (
             self._in_space(points)
             for points in (
@@ -320,6 +299,39 @@ class CorrectionField:
         largest = float(np.linalg.norm(correction(checks) + checks - expected, axis=1).max())
         error = SAFETY_FACTOR * largest + EXACT_ERROR
         return fallback if error > self.bound else _Box(correction, error)
+
+
+def command_points(tip: ToolTip, offsets: Array, points: Array) -> tuple[Array, Mapping[int, str]]:
+    """Exact points to command, and refused points with the reasons.
+
+        f(c(p) + o − s),  f the nominal forward kinematics,
+
+    with s the displacement of the drives by the controller's compensation, as while measuring.
+
+    Args:
+        tip: Tip of the tool on the calibrated machine.
+        offsets: Offsets o in the controller, shape (n_drives,), [m, rad].
+        points: Desired coordinates p that the drives command, shape (k, n_axes), [m].
+    """
+    displacement = tip.calibration.displacement
+    nominal = nominal_closure(tip.calibration.robot)
+    corrected = np.full(points.shape, np.nan)
+    refused: dict[int, str] = {}
+    for first in range(0, len(points), BATCH_SIZE):
+        batch = points[first : first + BATCH_SIZE]
+        failures: Failures = {}
+        motors = tip.reach(batch, failures=failures)[0] + offsets
+        drives = motors - displacement(motors)
+        drives = motors - displacement(drives)
+        reached = np.array([i for i in range(len(batch)) if i not in failures], dtype=np.int64)
+        nominal_failures: Failures = {}
+        commanded = nominal.forward(drives[reached], failures=nominal_failures)
+        corrected[first + reached] = commanded[:, tip.coordinates]
+        failures.update({int(reached[i]): e for i, e in nominal_failures.items()})
+        for i, e in failures.items():
+            refused[first + i] = e.reason
+            corrected[first + i] = np.nan
+    return corrected, refused
 
 
 def _cells(points: Array, side: float) -> Indices:

@@ -14,11 +14,12 @@ from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.assessment.wording import describe_refusal
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError, ExportError, ParameterError
+from orthocal.errors import ExportError, ParameterError
+from orthocal.export.correction_field import command_points
 from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linuxcnc
 from orthocal.export.printer import export_printer
+from orthocal.export.tool_tip import ToolTip
 from orthocal.export.urdf import export_urdf
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import uniform_grid
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.units import MM, format_fixed, tidy
@@ -54,12 +55,7 @@ def export_parameters(calibration: Calibration) -> dict[str, str]:
 def export_corrections(calibration: Calibration) -> dict[str, str]:
     """Text of corrections.csv: corrections of the tool over a grid, for a nominal controller.
 
-    A controller with the offsets o to enter sends the drives to ρ(p) − o for a point p. They must
-    be at c(p), the inverse kinematics of the calibrated machine. So the point to command is p + d,
-
-        d = f(c(p) + o − s) − p,  f the nominal forward kinematics,
-
-    with s the displacement of the drives by the controller's compensation, as while measuring.
+    The point to command is p + d, with d as in `command_points` for the offsets to enter.
 
     Raises:
         ExportError: If the drives do not command a tool, or the machine does not reach the grid.
@@ -68,19 +64,14 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     if tool is None or robot.tcp is None:
         raise ExportError("the machine has no tool that its drives command over a region")
     points = uniform_grid(robot, tool.workspace.limits, points_per_side=POINTS_PER_SIDE)
-    coordinates = list(robot.tcp.coordinates)
-    try:
-        motors = calibration.machine.inverse(points) + entered_offsets(calibration)
-        drives = motors - calibration.displacement(motors)
-        drives = motors - calibration.displacement(drives)
-        commanded = nominal_closure(robot).forward(drives)[:, coordinates]
-    except ClosureError as e:
+    commanded, refused = command_points(ToolTip(calibration), entered_offsets(calibration), points)
+    for reason in refused.values():
         raise ExportError(
-            f"the calibrated machine does not reach every point of the grid: {e}"
-        ) from None
+            f"the calibrated machine does not reach every point of the grid: {reason}"
+        )
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    names = ["xyz"[k] for k in coordinates]
+    names = ["xyz"[k] for k in robot.tcp.coordinates]
     rows.writerow([*(f"{n}_mm" for n in names), *(f"d{n}_mm" for n in names)])
     for point, correction in zip(points / MM, (commanded - points) / MM, strict=True):
         rows.writerow(

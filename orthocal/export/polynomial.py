@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from orthocal.arrays import Array, Indices
 
 
 @dataclass(frozen=True, slots=True, eq=False)

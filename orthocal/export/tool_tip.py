@@ -71,6 +71,7 @@ class ToolTip:
         robot = calibration.robot
         if robot.tcp is None or not robot.commands_tool:
             raise ExportError("the machine has no tool that its drives command")
+        self.calibration = calibration
         self.tool = np.array(tool, dtype=np.float64)
         require_tip(self.tool.tolist())
         self.coordinates = list(robot.tcp.coordinates)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Self, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import (
@@ -24,6 +24,7 @@ from pydantic import (
     Field,
     TypeAdapter,
     ValidationError,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
@@ -76,6 +77,24 @@ class Keys(BaseModel):
     """Keys of a document; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+
+class OneKey(Keys):
+    """Keys of which exactly one is stated."""
+
+    @model_validator(mode="after")
+    def _require_one(self) -> Self:
+        """Refuse several keys, or none."""
+        stated = [key for key, value in self if value is not None]
+        if len(stated) != 1:
+            expected = ", ".join(type(self).model_fields)
+            raise ValueError(f"found {' and '.join(stated) or 'none'}; expected one of {expected}")
+        return self
+
+    @property
+    def stated(self) -> tuple[str, Any]:
+        """The stated key and its value."""
+        return next((key, value) for key, value in self if value is not None)
 
 
 Number = Annotated[
@@ -241,7 +260,7 @@ def csv_rows(
     *,
     name: str,
     required: tuple[str, ...],
-    optional: tuple[str, ...] = (),
+    optional: tuple[str, ...] | None = (),
     error: type[OrthocalError],
     most: int | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
@@ -253,7 +272,7 @@ def csv_rows(
         lines: Lines with their line ends.
         name: Name of the file, for messages.
         required: Required columns.
-        optional: Optional columns.
+        optional: Optional columns; None to ignore all others.
         error: Kind of error to raise.
         most: Largest number of lines.
 
@@ -273,6 +292,7 @@ def csv_rows(
         header = [composed(cell.strip()) for cell in next(reader)]
         if invalid := _header_problem(header, required, optional):
             raise error(invalid, where=f"{name}:1")
+        read = [(i, c) for i, c in enumerate(header) if optional is not None or c in required]
         for row in reader:
             line = reader.line_num
             if most is not None and line > most:
@@ -287,20 +307,20 @@ def csv_rows(
                     f"({delimiter.join(header)}){hint}",
                     where=f"{name}:{line}",
                 )
-            yield line, {c: composed(cell.strip()) for c, cell in zip(header, row, strict=True)}
+            yield line, {c: composed(row[i].strip()) for i, c in read}
     except csv.Error as e:
         raise error(f"is not valid CSV: {e}", where=f"{name}:{reader.line_num}") from None
 
 
 def _header_problem(
-    header: Sequence[str], required: Sequence[str], optional: Sequence[str]
+    header: Sequence[str], required: Sequence[str], optional: Sequence[str] | None
 ) -> str | None:
     """First problem with the columns of a CSV file; None if there is none."""
     for name in header:
-        if name not in required and name not in optional:
+        if optional is not None and name not in (*required, *optional):
             more = f" and optionally {', '.join(optional)}" if optional else ""
             return f"unknown column '{shorten(name)}'; expected {', '.join(required)}{more}"
-        if header.count(name) > 1:
+        if header.count(name) > 1 and (optional is not None or name in required):
             return f"the column '{name}' occurs twice"
     missing = next((name for name in required if name not in header), None)
     if missing is None:

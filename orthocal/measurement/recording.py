@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -240,43 +240,28 @@ def _recorded_rows(
     )
 
 
+@dataclass(slots=True, eq=False)
 class Recording:
-    """Session that is being measured, locked against other recordings.
+    """Session that is being measured, locked against other recordings."""
 
-    Args:
-        session: The session at the start of the recording.
-        rows: Its rows in the order of measurement; NaN before they are read.
-        journal: Journal of the changes.
-        digest: Digest of the CSV on disk.
-        dropped: Keys of the rows that earlier recordings deleted, by their line.
-        temperature: Temperature that was typed last, [°C].
-        restored: Number of changes that a killed recording had not written to the CSV.
-        edited: Whether the CSV differs from all versions that the killed recording wrote.
-        wrong: Errors of readings out of range in the CSV, which count as missing.
-    """
-
-    def __init__(
-        self,
-        session: Session,
-        rows: Sequence[RecordedReading],
-        journal: Journal,
-        *,
-        digest: str,
-        dropped: Mapping[int, list[ReadingKey]],
-        temperature: float | None = None,
-        restored: int = 0,
-        edited: bool = False,
-        wrong: Sequence[SessionError] = (),
-    ) -> None:
-        self.session = session
-        self.rows = tuple(rows)
-        self.restored = restored
-        self.edited = edited
-        self.wrong = tuple(wrong)
-        self.temperature = temperature
-        self._journal = journal
-        self._digest = digest
-        self._dropped = dict(dropped)
+    session: Session
+    """The session; its readings are those at the start of the recording."""
+    rows: tuple[RecordedReading, ...]
+    """Rows in the order of measurement; NaN before they are read."""
+    journal: Journal
+    """Journal of the changes."""
+    digest: str
+    """Digest of the CSV on disk."""
+    dropped: dict[int, list[ReadingKey]]
+    """Keys of the rows that earlier recordings deleted, by their line."""
+    temperature: float | None
+    """Temperature that was typed last, [°C]."""
+    restored: int
+    """Number of changes that a killed recording had not written to the CSV."""
+    edited: bool
+    """Whether the CSV differs from all versions that the killed recording wrote."""
+    wrong: Sequence[SessionError]
+    """Errors of readings out of range in the CSV, which count as missing."""
 
     @property
     def path(self) -> Path:
@@ -429,16 +414,16 @@ class Recording:
         stated = self._state_alignment(change_rows(self.rows, change))
         self._apply(change)
         if line is not None:
-            self._dropped[line] = emptied
+            self.dropped[line] = emptied
         return stated
 
     def is_deleted(self, line: int) -> bool:
         """True for the line of a row that was deleted and not added again."""
-        return line in self._dropped and self.present_line(line) is None
+        return line in self.dropped and self.present_line(line) is None
 
     def present_line(self, line: int) -> int | None:
         """Line of a deleted row since it was added again; None for other rows."""
-        keys = self._dropped.get(line, [])
+        keys = self.dropped.get(line, [])
         return next((r.line for r in self.rows if r.emptied.key in keys), None)
 
     def _state_alignment(self, remaining: Sequence[Reading]) -> dict[str, str]:
@@ -465,7 +450,7 @@ class Recording:
         Raises:
             OutputError: If the files cannot be written.
         """
-        dropped = self._dropped[line]
+        dropped = self.dropped[line]
         existing = [r.key for r in self.rows[: len(dropped)]]
         self._apply(Change(done="added", rows=[*existing, *dropped]))
         return len(self.rows) - len(dropped)
@@ -476,7 +461,7 @@ class Recording:
         Raises:
             OutputError: If the journal cannot be written.
         """
-        self._journal.append({"temperature_C": temperature})
+        self.journal.append({"temperature_C": temperature})
         self.temperature = temperature
 
     def empty(self, index: int) -> None:
@@ -490,7 +475,7 @@ class Recording:
     def close(self) -> None:
         """Close the journal: from now on the CSV counts."""
         with suppress(OutputError):
-            self._journal.append(CLOSED)
+            self.journal.append(CLOSED)
 
     def _apply(self, change: Change) -> None:
         """Change the rows: first in the journal, then in the CSV, then in memory."""
@@ -501,12 +486,12 @@ class Recording:
             line = change.model_dump(mode="json", exclude_none=True, by_alias=True) | {
                 "rows": [list(key) for key in change.rows],
                 "at": datetime.now(UTC).isoformat(timespec="seconds"),
-                "before": self._digest,
+                "before": self.digest,
                 "after": digest,
             }
-            self._journal.append(line)
+            self.journal.append(line)
             _write(self.path, content)
-            self.rows, self._digest = rows, digest
+            self.rows, self.digest = rows, digest
 
 
 def _conditions_to_state(row: RecordedReading, conditions: Conditions) -> Conditions | None:
@@ -587,12 +572,12 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             session,
             rows,
             journal,
-            digest=_digest(table),
-            dropped=_find_dropped(session, [*closed, *(change for _, change in lines)]),
-            temperature=past.temperature,
-            restored=len(pending),
-            edited=edited,
-            wrong=wrong,
+            _digest(table),
+            _find_dropped(session, [*closed, *(change for _, change in lines)]),
+            past.temperature,
+            len(pending),
+            edited,
+            wrong,
         )
         try:
             yield recording

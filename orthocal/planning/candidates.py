@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
@@ -97,7 +96,7 @@ class CandidateSetup:
     covariance: Array
     """Covariance of the readings from the setup's nuisance parameters, for points with their free
     zeros, shape (m width, m width), [m²]."""
-    reachable: NDArray[np.bool_]
+    reachable: Mask
     """Mask of readings (columns) within the range of a gauge that begins in another reading (rows),
     shape (m, m)."""
     aligned: tuple[AlignedParameter, ...] = ()

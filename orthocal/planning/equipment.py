@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
@@ -210,7 +209,7 @@ def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
     return max(math.floor(far / BOX_STEP + 1e-9) * BOX_STEP, 0.0)
 
 
-def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
+def reachable(robot: Robot, points: Array) -> Mask:
     """Mask of tool positions that the nominal machine reaches within its travel, shape (n,).
 
     Args:
@@ -220,7 +219,7 @@ def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
     return _reach_points(robot, points)[1]
 
 
-def _reach_points(robot: Robot, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _reach_points(robot: Robot, points: Array) -> tuple[Array, Mask]:
     """Drive coordinates of tool positions, and the mask of those within the travel."""
     failures = Failures()
     drives = nominal_closure(robot).inverse(points, failures=failures)

@@ -16,9 +16,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.planning.candidates import CandidateSetup
 from orthocal.planning.ranking import first_largest
 from orthocal.statistics.zeros import eliminate_zero
@@ -372,7 +371,7 @@ class PointGain:
         return self._grow(pair, count, ~self.setup.reachable[pair[0]])
 
     def _grow(
-        self, first: tuple[int, ...], count: int, excluded: NDArray[np.bool_]
+        self, first: tuple[int, ...], count: int, excluded: Mask
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
         """Add points to the first ones; each is w further columns of the Cholesky factor of V."""
         w, effect, variance = self.setup.width, self.effect, self._blocks(self.spread)

@@ -210,8 +210,8 @@ def plan_readings(
     counts = _list_counts(setups, readings, hours, equipment, robot)
     counts_or_minutes: Sequence[list[int]] | float = counts
     if equipment.owned and setups is None and readings is None:
-        minutes = equipment.minutes(*_totals(counts[0])) if hours is None else HOUR * hours
-        counts_or_minutes = minutes
+        total = equipment.minutes(len(counts[0]), sum(counts[0]) + len(counts[0]))
+        counts_or_minutes = total if hours is None else HOUR * hours
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
     session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
@@ -230,11 +230,6 @@ def _require_arguments(
         raise ParameterError(
             f"found '{criterion}'; expected one of {', '.join(CRITERIA)}", where="criterion"
         )
-
-
-def _totals(counts: Sequence[int]) -> tuple[int, int]:
-    """Numbers of setups and of readings, including the closing ones."""
-    return len(counts), sum(counts) + len(counts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

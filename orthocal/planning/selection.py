@@ -184,7 +184,7 @@ class SetupSearch:
         known = [] if first is None else [(0, first)]
         done: dict[int, PlannedSetups] = {}
         reported, best = 0, None
-        work = partial(_run, self, drawn)
+        work = partial(self._run_start, drawn)
         searched = run_in_parallel(work, range(len(known), starts), workers, killed=KILLED)
         for start, setups in chain(known, searched):
             done[start] = setups
@@ -220,6 +220,9 @@ class SetupSearch:
     def improve(self, setups: Sequence[PlannedSetup]) -> PlannedSetups:
         """Plan with these setups exchanged for better ones."""
         return self.run([(len(s.chosen), s) for s in setups])
+
+    def _run_start(self, starts: Sequence[_Start], which: int) -> PlannedSetups:
+        return self.run(starts[which])
 
     def run(self, start: _Start) -> PlannedSetups:
         """Add the setups of one start one by one, then exchange them."""
@@ -319,11 +322,6 @@ class SetupSearch:
                 setups = (*plan.setups[:k], new, *plan.setups[k + 1 :])
                 best = PlannedSetups(setups, information, error)
         return best
-
-
-def _run(search: SetupSearch, starts: Sequence[_Start], which: int) -> PlannedSetups:
-    """Setups of one start; a function of the module because processes need one."""
-    return search.run(starts[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.planning.candidates import CandidateSetup
 from orthocal.planning.information_gain import pair_gains
 from orthocal.planning.ranking import first_largest_of_rows
@@ -35,7 +34,7 @@ class SetupStack:
     """A of each setup, shape (n_setups, m, n_state)."""
     covariance: Array
     """D of each setup, shape (n_setups, m, m), [m²]."""
-    possible: NDArray[np.bool_]
+    possible: Mask
     """Mask of pairs within the gauge's range, shape (n_setups, m, m)."""
     within_range: Indices
     """Number of readings within the gauge's range if it begins in each reading,

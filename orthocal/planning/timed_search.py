@@ -110,7 +110,7 @@ class TimedSearch:
         gauges = dict.fromkeys(s.gauge for s in self.search.reduced)
         first_gauges: list[str | None] = [None, *gauges] if len(gauges) > 1 else [None]
         first_gauges = first_gauges[:starts]
-        work = partial(_run, self, minutes, first_gauges)
+        work = partial(self._run_start, minutes, first_gauges)
         done: dict[int, PlannedSetups] = {}
         indices = range(len(first_gauges))
         for which, planned in run_in_parallel(work, indices, workers, killed=KILLED):
@@ -127,6 +127,9 @@ class TimedSearch:
                 where="plan",
             )
         return best
+
+    def _run_start(self, minutes: float, starts: Sequence[str | None], which: int) -> PlannedSetups:
+        return self.run(minutes, starts[which])
 
     def run(self, minutes: float, first: str | None) -> PlannedSetups:
         """Setups of one start.
@@ -267,10 +270,3 @@ class TimedSearch:
                 changed = self.search.extend(without, new)
                 best = changed if best is None else best_of([best, changed], _negative_error)
         return without if best is None else best
-
-
-def _run(
-    search: TimedSearch, minutes: float, starts: Sequence[str | None], which: int
-) -> PlannedSetups:
-    """Setups of one start; a function of the module because processes need one."""
-    return search.run(minutes, starts[which])

@@ -20,7 +20,7 @@ from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import Sensor, default_zero, tool_path
+from orthocal.sensors.protocol import Sensor, default_zero, place_point, tool_path
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import names_in_files, split_setup
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Setup
@@ -187,8 +187,7 @@ class _Positions:
         def poses(frame: str) -> Array:
             return functions.pose(frame)(drives, passive, placements)[0]
 
-        tool = poses(require_tcp(self.robot).frame)
-        ball = tool[:, :3, 3] + tool[:, :3, :3] @ np.array(bar.tool)
+        ball = place_point(poses(require_tcp(self.robot).frame), bar.tool)
         fixed = np.broadcast_to(bar.centre, ball.shape)
         clear = np.ones(len(names), dtype=np.bool_)
         for rod in self.robot.rods.values():
@@ -240,21 +239,17 @@ def _places(
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
     """Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement."""
     if sensor.keys["sensor"] == "ball_bar":
-        yield from _bars(sensor, robot, box)
-        return
-    if sensor.keys["sensor"] == "probe":
-        yield from _beds(sensor, middle, box)
-        return
-    if sensor.keys["sensor"] == "points":
-        yield sensor.name, {}, _points(box)
-        return
+        return _bars(sensor, robot, box)
     places = {
+        "probe": _beds,
+        "points": _points,
         "square": _edges,
         "straightedge": _edges,
         "plate": _plates,
         "gauge_block": _blocks,
     }
-    yield from places[sensor.keys["artefact"]["kind"]](sensor, middle, box)
+    kind = sensor.keys.get("artefact", {}).get("kind", sensor.keys["sensor"])
+    return places[kind](sensor, middle, box)
 
 
 def _bars(
@@ -315,12 +310,16 @@ def _beds(
     yield sensor.name, {}, points
 
 
-def _points(box: Array) -> Array:
-    """Positions of a target in a box, shape (n, n_coordinates), [m]."""
+def _points(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Positions of a target in a box."""
+    del middle
     lines = [
         np.round(np.linspace(low, high, LINE_POINTS) / STEP) * STEP for low, high in box.tolist()
     ]
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
+    yield sensor.name, {}, points
 
 
 def _edges(

@@ -10,9 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from orthocal.arrays import Array
+
 Evaluate = Callable[[Array], tuple[Array, Array]]
 """Function of the coordinates: residual, shape (m,), and its Jacobian, shape (m, n)."""
 

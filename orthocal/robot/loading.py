@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError, RobotError
@@ -312,7 +311,7 @@ def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
     return Tcp(tcp.frame, tuple(sorted("xyz".index(c) for c in set(tcp.coordinates))))
 
 
-def _read_workspace(keys: RobotKeys, where: str) -> NDArray[np.float64] | None:
+def _read_workspace(keys: RobotKeys, where: str) -> Array | None:
     """Box of the workspace, shape (n_coordinates, 2), [m]."""
     tcp, workspace = keys.orthocal.tcp, keys.orthocal.workspace
     if workspace is None:

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
@@ -49,6 +49,20 @@ class Drive(InUnit):
     joint_zero: float | None = None
     """Joint coordinate of the controller at the mechanical zero, [unit]; None for `zero`."""
 
+    @property
+    def joint_unit(self) -> str:
+        """Unit in which users read coordinates: mm or deg."""
+        return DRIVE_UNITS[self.unit][0]
+
+    @property
+    def joint_size(self) -> float:
+        """Size of this unit in SI."""
+        return DRIVE_UNITS[self.unit][1]
+
+    def show(self, value: float, form: str = ".3f") -> str:
+        """Coordinate or length, [unit], as text with the unit that users read."""
+        return f"{value / self.joint_size:{form}} {self.joint_unit}"
+
     def to_joint(self, coordinate: ArrayLike) -> Array:
         """Joint coordinates of the controller from drive coordinates, any shape, [unit]."""
         return self._displayed_zero + self.direction * (
@@ -80,10 +94,11 @@ class Drive(InUnit):
 
     def describe_beyond(self, coordinate: float) -> str:
         """Description of a position, [unit], and of the limits, in joint coordinates."""
-        unit, size = DRIVE_UNITS[self.unit]
-        low, high = (v / size for v in self.joint_limits)
-        value = float(self.to_joint(coordinate)) / size
-        return f"at {value:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
+        low, high = self.joint_limits
+        value = self.show(float(self.to_joint(coordinate)), ".4g")
+        return (
+            f"at {value}, outside its limits {low / self.joint_size:g} ... {self.show(high, 'g')}"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,9 +237,9 @@ class Robot:
     """Errors declared in the YAML, for `orthocal.effects`."""
     parameters: ParameterSet
     """Error parameters, from `orthocal.effects.loading`."""
-    drive_index: NDArray[np.int64]
+    drive_index: Indices
     """Indices of the actuated coordinates, shape (n_drives,)."""
-    passive_index: NDArray[np.int64]
+    passive_index: Indices
     """Indices of the passive coordinates, shape (n_passive,)."""
     reference_posture: Array
     """Joint coordinates with the drives at their mechanical zero, shape (nv,), [m, rad]."""
@@ -380,9 +395,7 @@ class Robot:
             )
         return np.asarray(closing.coordinates[self.passive_index])
 
-    def close_coordinates(
-        self, start: Array, free: NDArray[np.int64], *, limited: bool = True
-    ) -> Closing:
+    def close_coordinates(self, start: Array, free: Indices, *, limited: bool = True) -> Closing:
         """Close the loops by some of the joint coordinates, within their limits by default.
 
         Args:
@@ -550,7 +563,7 @@ def joint_axis(model: pin.Model, joint: int) -> Array:
     return np.asarray(joint_data.S, dtype=np.float64).reshape(-1)
 
 
-def closure_turns(robot: Robot) -> NDArray[np.bool_]:
+def closure_turns(robot: Robot) -> Mask:
     """Mask of the closure rows that are rotations, shape (closure_rows,)."""
     return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
 
@@ -565,8 +578,7 @@ def drive_keys(quantity: str, drives: Sequence[Drive], values: Sequence[float]) 
     """
     texts: dict[str, list[str]] = {}
     for drive, value in zip(drives, values, strict=True):
-        unit, size = DRIVE_UNITS[drive.unit]
-        texts.setdefault(unit, []).append(f"{value / size:.6g}")
+        texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.6g}")
     return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
 
 
@@ -578,7 +590,7 @@ def closure_row_units(robot: Robot) -> Array:
     return np.where(closure_turns(robot), robot.characteristic_length, 1.0)
 
 
-def coordinate_turns(model: pin.Model) -> NDArray[np.bool_]:
+def coordinate_turns(model: pin.Model) -> Mask:
     """Mask of the joint coordinates that are rotations, shape (nv,)."""
     turns = [joint_axis(model, i)[3:].any() for i in range(1, model.njoints)]
     return np.array(turns, dtype=np.bool_)

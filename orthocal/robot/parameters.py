@@ -17,9 +17,9 @@ from glob import escape, has_magic
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.arguments import require_numbers
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.text import composed
 from orthocal.units import EDGE_UNITS, UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit, tidy
@@ -211,7 +211,7 @@ class ParameterSet:
         """Elementary errors that neither the tool nor a gauge can observe."""
         return self._find_redundant() if self.defaults is self else self.defaults.redundant
 
-    def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
+    def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> Array:
         """Contribution of one unit of each named parameter to each error, (n_errors, n_names).
 
         Raises:

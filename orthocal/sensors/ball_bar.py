@@ -23,20 +23,21 @@ from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.io.documents import Name, Number
-from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.mounting import LARGEST_SCALE, SCALE
+from orthocal.robot.model import Robot
+from orthocal.sensors.mounting import SCALE, ScaleTolerance
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
-    Frames,
     GaugeZero,
     NuisanceParameter,
     Sensor,
     SetupKeys,
     ToolSensor,
     View,
+    place_point,
+    triple,
 )
-from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
+from orthocal.units import MM, read_tolerance, show_tolerance, to_mm
 
 CENTRE_STD = 1.0 * MM
 """Prior standard deviation of a coordinate of a fixed ball to which the tool was jogged, [m]."""
@@ -65,7 +66,7 @@ class BallBarKeys(SetupKeys):
     """Nominal position of the fixed ball in the world frame."""
     ball: Name | None = None
     """Name of the fixed ball, if it stays in its place for several setups."""
-    centre_tolerance_mm: Tolerance = show_limit(CENTRE_STD) / MM
+    centre_tolerance_mm: Tolerance = show_tolerance(CENTRE_STD, MM)
     """Tolerance of each coordinate of the fixed ball; 0 if the position is known."""
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Ball at the tool, from the tool centre point, in the tool's frame."""
@@ -73,7 +74,7 @@ class BallBarKeys(SetupKeys):
     """Distance of the balls at reading 0."""
     length_tolerance_mm: Tolerance | Literal["unknown"] = 0.0
     """Tolerance of the length; 0 if it is known."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
     """Tolerance of the dial's scale, dimensionless."""
 
 
@@ -110,14 +111,14 @@ class BallBar(ToolSensor):
         tolerance = keys.length_tolerance_mm
         length_std = UNKNOWN_LENGTH_STD
         if tolerance != "unknown":
-            length_std = tidy(read_limit(tolerance) * MM)
+            length_std = read_tolerance(tolerance, MM)
         return cls(
-            centre=_metres(keys.centre_mm),
+            centre=triple(keys.centre_mm, MM),
             length=keys.length_mm * MM,
-            centre_std=tidy(read_limit(keys.centre_tolerance_mm) * MM),
+            centre_std=read_tolerance(keys.centre_tolerance_mm, MM),
             length_std=length_std,
-            scale_std=read_limit(keys.scale_tolerance),
-            tool=_metres(keys.tool_mm),
+            scale_std=read_tolerance(keys.scale_tolerance),
+            tool=triple(keys.tool_mm, MM),
             ball=keys.ball,
         )
 
@@ -125,7 +126,7 @@ class BallBar(ToolSensor):
         """Keys for a session.yaml."""
         keys: dict[str, Any] = {
             "centre_mm": [to_mm(v) for v in self.centre],
-            "centre_tolerance_mm": tidy(show_limit(self.centre_std) / MM),
+            "centre_tolerance_mm": show_tolerance(self.centre_std, MM),
             "length_mm": to_mm(self.length),
         }
         if self.ball is not None:
@@ -134,10 +135,10 @@ class BallBar(ToolSensor):
             keys["tool_mm"] = [to_mm(v) for v in self.tool]
         if self.length_std:
             unknown = self.length_std == UNKNOWN_LENGTH_STD
-            tolerance = "unknown" if unknown else tidy(show_limit(self.length_std) / MM)
+            tolerance = "unknown" if unknown else show_tolerance(self.length_std, MM)
             keys["length_tolerance_mm"] = tolerance
         if self.scale_std != SCALE:
-            keys["scale_tolerance"] = show_limit(self.scale_std)
+            keys["scale_tolerance"] = show_tolerance(self.scale_std)
         return keys
 
     def describe(self) -> str:
@@ -201,10 +202,6 @@ class BallBar(ToolSensor):
         unit = np.cos(share * angle) * first + np.sin(share * angle) * across
         return np.asarray((radii[0] + share * (radii[1] - radii[0])) * unit - offset)
 
-    def frames(self, robot: Robot) -> Frames:
-        """Frame of the tool."""
-        return Frames((require_tcp(robot).frame,))
-
     def constants(self, robot: Robot) -> Array:
         """Position of the fixed ball (3), length (1), position of the ball at the tool (3), [m]."""
         del robot
@@ -245,8 +242,7 @@ class BallBar(ToolSensor):
         The direction of a growing reading is that of the bar in the first posture.
         """
         del at_zero, robot
-        poses = frames[0]
-        balls = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.tool)
+        balls = place_point(frames[0], self.tool)
         bars = balls - np.array(self.centre)
         distances = np.linalg.norm(bars, axis=1)
         units = bars / np.maximum(distances, 1e-12)[:, None]
@@ -260,8 +256,3 @@ class BallBar(ToolSensor):
         ]
         centre = np.array(self.centre)
         return Contact(balls, direction, along, problems, "centre_mm", fixed=centre)
-
-
-def _metres(point: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = (v * MM for v in point)
-    return x, y, z

@@ -22,7 +22,7 @@ from pydantic import Field
 from orthocal.arrays import Array
 from orthocal.io.documents import Number
 from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.mounting import LARGEST_SCALE, SCALE
+from orthocal.sensors.mounting import SCALE, ScaleTolerance
 from orthocal.sensors.protocol import (
     Contact,
     Frames,
@@ -32,7 +32,7 @@ from orthocal.sensors.protocol import (
     ToolSensor,
     View,
 )
-from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
+from orthocal.units import MM, read_tolerance, show_tolerance, to_mm
 
 LARGEST_MM = 5000.0
 """Largest accepted distance and width, [mm]; a larger one has a wrong unit."""
@@ -48,7 +48,7 @@ class DistanceKeys(SetupKeys):
     """Measured width of the pillar that the calliper includes."""
     width_tolerance_mm: Tolerance = 0.0
     """Tolerance of the width; 0 if it is known."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
     """Tolerance of the scale of calliper and print, dimensionless; setups with one gauge share the
     error."""
 
@@ -79,8 +79,8 @@ class Distance(ToolSensor):
         """Build from the keys of a session.yaml."""
         return cls(
             width=keys.width_mm * MM,
-            width_std=tidy(read_limit(keys.width_tolerance_mm) * MM),
-            scale_std=read_limit(keys.scale_tolerance),
+            width_std=read_tolerance(keys.width_tolerance_mm, MM),
+            scale_std=read_tolerance(keys.scale_tolerance),
         )
 
     def to_keys(self) -> dict[str, Any]:
@@ -89,9 +89,9 @@ class Distance(ToolSensor):
         if self.width:
             keys["width_mm"] = to_mm(self.width)
         if self.width_std:
-            keys["width_tolerance_mm"] = tidy(show_limit(self.width_std) / MM)
+            keys["width_tolerance_mm"] = show_tolerance(self.width_std, MM)
         if self.scale_std != SCALE:
-            keys["scale_tolerance"] = show_limit(self.scale_std)
+            keys["scale_tolerance"] = show_tolerance(self.scale_std)
         return keys
 
     def describe(self) -> str:

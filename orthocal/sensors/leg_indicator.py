@@ -19,15 +19,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, cast, get_args
 
 import casadi as ca
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.io.documents import Keys, Name, Number
+from orthocal.io.documents import Name, Number, OneKey
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import (
     DIRECTIONS,
@@ -46,6 +46,7 @@ from orthocal.sensors.protocol import (
     SetupKeys,
     TouchingTip,
     View,
+    triple,
 )
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM, to_mm
@@ -76,7 +77,7 @@ LATERAL_DECIMALS = 9
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
 
-class SectionKeys(Keys):
+class SectionKeys(OneKey):
     """Section: position along the leg's nominal axis at which the gauge touches."""
 
     coordinate_mm: Number | None = None
@@ -85,16 +86,6 @@ class SectionKeys(Keys):
     """Distance from the root in the mechanical zero."""
     fraction: Number | None = None
     """Distance from the root in the mechanical zero, as a fraction of the leg length."""
-
-    @model_validator(mode="after")
-    def _require_one_form(self) -> SectionKeys:
-        """Refuse several forms, or none."""
-        forms = get_args(SectionForm)
-        stated = [k for k in forms if getattr(self, k) is not None]
-        if len(stated) != 1:
-            text = " and ".join(stated) if stated else "none"
-            raise ValueError(f"found {text}; expected one of {', '.join(forms)}")
-        return self
 
 
 class LegKeys(MountingKeys, SetupKeys):
@@ -144,9 +135,8 @@ class Section:
     @staticmethod
     def from_keys(keys: SectionKeys) -> Section:
         """Build from the keys of a session.yaml."""
-        form = next(f for f in get_args(SectionForm) if getattr(keys, f) is not None)
-        value = getattr(keys, form)
-        return Section(form, value if form == "fraction" else value * MM)
+        form, value = keys.stated
+        return Section(cast(SectionForm, form), value if form == "fraction" else value * MM)
 
     def to_keys(self) -> dict[str, float]:
         """Keys for a session.yaml."""
@@ -193,7 +183,7 @@ class LegIndicator:
             SessionError: If a rod is stated without a tip, or a displacement without a rod.
         """
         stated = keys.direction
-        direction = stated if isinstance(stated, str) else (stated[0], stated[1], stated[2])
+        direction = stated if isinstance(stated, str) else triple(stated)
         section, mounting = Section.from_keys(keys.section), Mounting.from_keys(keys)
         indicator = LegIndicator(keys.leg, direction, section, mounting)
         if keys.touches is None:
@@ -204,8 +194,8 @@ class LegIndicator:
             return indicator
         if keys.tip is None:
             raise SessionError("is missing; expected ball or blade", where="tip")
-        x, y, z = keys.beside_mm or (0.0, 0.0, 0.0)
-        return indicator.on_rod(keys.touches, Tip.from_keys(keys.tip), (x * MM, y * MM, z * MM))
+        beside = triple(keys.beside_mm or (0.0, 0.0, 0.0), MM)
+        return indicator.on_rod(keys.touches, Tip.from_keys(keys.tip), beside)
 
     def on_rod(
         self, rod: str, tip: Tip, beside: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -335,8 +325,8 @@ class LegIndicator:
         """Virtual sensor of the lateral position of a ball; empty for other tips."""
         if self.tip.form != "ball":
             return {}
-        x, y, z = self._side(robot).tolist()
-        return {"lateral": LegIndicator(self.leg, (x, y, z), self.section, EXACT, self.rod)}
+        side = triple(self._side(robot))
+        return {"lateral": LegIndicator(self.leg, side, self.section, EXACT, self.rod)}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Reading with the gauge zero at 0, [m]."""
@@ -481,8 +471,7 @@ class LegIndicator:
 
     def _side(self, robot: Robot) -> Array:
         """Unit vector across leg and plunger, shape (3,): the direction of a blade's edge."""
-        x, y, z = robot.legs[self.leg].axis.tolist()
-        return side_vector((x, y, z), self.direction)
+        return side_vector(triple(robot.legs[self.leg].axis), self.direction)
 
 
 class BallIndicator(LegIndicator):
@@ -509,8 +498,8 @@ class BallIndicator(LegIndicator):
         root, end = (pose[0, :3, 3] for pose in frames)
         normal = np.cross(end - root, direction)
         distance = float((root - start) @ normal / (side @ normal))
-        x, y, z = (round(distance * v, LATERAL_DECIMALS) + 0.0 for v in side.tolist())
-        return replace(self, beside=(x, y, z))
+        beside = triple([round(distance * v, LATERAL_DECIMALS) for v in side.tolist()])
+        return replace(self, beside=beside)
 
 
 def _coordinate_plane(leg: Leg, value: float, where: str) -> float:

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from orthocal.io.documents import Keys, Name, Number
 from orthocal.sensors.protocol import NuisanceParameter
-from orthocal.units import MM, MRAD, read_limit, show_limit, tidy
+from orthocal.units import MM, MRAD, read_tolerance, show_tolerance
 
 DIRECTION_STD = 10 * MRAD
 """Prior standard deviation of the direction of a plunger aligned by eye, [rad]."""
@@ -36,6 +36,9 @@ LARGEST_TOLERANCE_MM = 40.0
 LARGEST_TOLERANCE_MRAD = 400.0
 LARGEST_SCALE = 0.4
 
+ScaleTolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)]
+"""Tolerance of the scale of a gauge, dimensionless."""
+
 Millimetres = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MM)]
 Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
 
@@ -43,11 +46,11 @@ Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
 class MountingKeys(Keys):
     """Tolerances of a gauge's mounting in a session.yaml; 0 for a parameter without error."""
 
-    direction_tolerance_mrad: Milliradians = show_limit(DIRECTION_STD) / MRAD
-    section_tolerance_mm: Millimetres = show_limit(POSITION_STD) / MM
-    lateral_tolerance_mm: Millimetres = show_limit(POSITION_STD) / MM
+    direction_tolerance_mrad: Milliradians = show_tolerance(DIRECTION_STD, MRAD)
+    section_tolerance_mm: Millimetres = show_tolerance(POSITION_STD, MM)
+    lateral_tolerance_mm: Millimetres = show_tolerance(POSITION_STD, MM)
     """Lateral position of a ball; other tips have none."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
     """Scale of the dial: one for all setups with the same gauge."""
     stand: Name | None = None
     """Square block that several setups of this leg share, with its roll."""
@@ -93,12 +96,12 @@ class Mounting:
         """Build from the keys of a session.yaml."""
         square = keys.square_tolerance_mrad
         return Mounting(
-            direction=tidy(read_limit(keys.direction_tolerance_mrad) * MRAD),
-            section=tidy(read_limit(keys.section_tolerance_mm) * MM),
-            lateral=tidy(read_limit(keys.lateral_tolerance_mm) * MM),
-            scale=read_limit(keys.scale_tolerance),
+            direction=read_tolerance(keys.direction_tolerance_mrad, MRAD),
+            section=read_tolerance(keys.section_tolerance_mm, MM),
+            lateral=read_tolerance(keys.lateral_tolerance_mm, MM),
+            scale=read_tolerance(keys.scale_tolerance),
             stand=keys.stand,
-            square=SQUARE_STD if square is None else tidy(read_limit(square) * MRAD),
+            square=SQUARE_STD if square is None else read_tolerance(square, MRAD),
         )
 
     def to_keys(self) -> dict[str, Any]:
@@ -110,9 +113,7 @@ class Mounting:
             "scale_tolerance": (self.scale, USUAL.scale, 1.0),
             "square_tolerance_mrad": (self.square, USUAL.square, MRAD),
         }
-        keys = {
-            k: tidy(show_limit(v) / unit) for k, (v, usual, unit) in values.items() if v != usual
-        }
+        keys = {k: show_tolerance(v, unit) for k, (v, usual, unit) in values.items() if v != usual}
         return keys if self.stand is None else {**keys, "stand": self.stand}
 
     def nuisance_parameters(self, *, ball: bool) -> tuple[NuisanceParameter, ...]:

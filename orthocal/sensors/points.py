@@ -30,18 +30,20 @@ from pydantic import Field
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number
-from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.mounting import rotate
+from orthocal.robot.model import Robot
+from orthocal.sensors.mounting import ScaleTolerance, rotate
 from orthocal.sensors.protocol import (
     Contact,
-    Frames,
     GaugeZero,
     NuisanceParameter,
     SetupKeys,
     ToolSensor,
+    Triple,
     View,
+    place_point,
+    triple,
 )
-from orthocal.units import MM, MRAD, UM, read_limit, show_limit, tidy, to_mm
+from orthocal.units import MM, MRAD, UM, read_tolerance, show_tolerance, tidy, to_mm
 
 LARGEST_MM = 100_000.0
 """Largest coordinate, [mm]: the reach of a laser tracker."""
@@ -58,7 +60,6 @@ Covariance = Annotated[
     list[Annotated[list[Number], Field(min_length=3, max_length=3)]],
     Field(min_length=3, max_length=3),
 ]
-Triple = tuple[float, float, float]
 
 
 class FrameKeys(Keys):
@@ -87,7 +88,7 @@ class PointKeys(SetupKeys):
     frame: Literal["unknown"] | FrameKeys = "unknown"
     station: Name | None = None
     """Name of the station, if several setups share its pose."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=0.4)] = 0.0
+    scale_tolerance: ScaleTolerance = 0.0
     covariance_um2: Covariance | None = None
     """Covariance of the coordinates of a point in the frame of the station; by default independent
     coordinates with the gauge's sigma_mm."""
@@ -132,14 +133,14 @@ class Points(ToolSensor):
         frame_std = ABOUT_FIT
         if isinstance(keys.frame, FrameKeys):
             frame_std = (
-                tidy(read_limit(keys.frame.tolerance_mm) * MM),
-                tidy(read_limit(keys.frame.tolerance_mrad) * MRAD),
+                read_tolerance(keys.frame.tolerance_mm, MM),
+                read_tolerance(keys.frame.tolerance_mrad, MRAD),
             )
         points = cls(
-            target=_triple(keys.target_mm, MM),
+            target=triple(keys.target_mm, MM),
             frame_std=frame_std,
             station=keys.station,
-            scale_std=read_limit(keys.scale_tolerance),
+            scale_std=read_tolerance(keys.scale_tolerance),
             covariance=None
             if keys.covariance_um2 is None
             else read_covariance(keys.covariance_um2),
@@ -148,9 +149,9 @@ class Points(ToolSensor):
             return points
         return replace(
             points,
-            along=_triple(keys.axis.along),
-            position=_triple(keys.axis.station_mm, MM),
-            rotation=_triple(keys.axis.station_rad),
+            along=triple(keys.axis.along),
+            position=triple(keys.axis.station_mm, MM),
+            rotation=triple(keys.axis.station_rad),
         )
 
     def to_keys(self) -> dict[str, Any]:
@@ -158,12 +159,12 @@ class Points(ToolSensor):
         keys: dict[str, Any] = {"target_mm": [to_mm(v) for v in self.target]}
         if self.frame_std != ABOUT_FIT:
             units = zip(self.frame_std, (MM, MRAD), strict=True)
-            limits = [tidy(show_limit(std) / unit) for std, unit in units]
+            limits = [show_tolerance(std, unit) for std, unit in units]
             keys["frame"] = {"tolerance_mm": limits[0], "tolerance_mrad": limits[1]}
         if self.station is not None:
             keys["station"] = self.station
         if self.scale_std:
-            keys["scale_tolerance"] = show_limit(self.scale_std)
+            keys["scale_tolerance"] = show_tolerance(self.scale_std)
         if self.covariance is not None:
             keys["covariance_um2"] = [[tidy(v / UM**2) for v in row] for row in self.covariance]
         if self.along is not None:
@@ -195,7 +196,7 @@ class Points(ToolSensor):
             variances, axes = np.linalg.eigh(covariance)
             stds, labels = np.sqrt(variances), "123"
         return {
-            label: (replace(self, along=_triple(axes[:, i].tolist())), float(stds[i]))
+            label: (replace(self, along=triple(axes[:, i].tolist())), float(stds[i]))
             for i, label in enumerate(labels)
         }
 
@@ -221,14 +222,10 @@ class Points(ToolSensor):
             "them into `orthocal record`.",
         )
 
-    def frames(self, robot: Robot) -> Frames:
-        """Frame of the tool."""
-        return Frames((require_tcp(robot).frame,))
-
     def constants(self, robot: Robot) -> Array:
         """Coordinate axis in the world frame (3), positions of station (3) and target (3), [m]."""
         del robot
-        along = rotation_matrix(self.rotation) @ np.array(self.along or (0.0, 0.0, 0.0))
+        along = pin.exp3(np.array(self.rotation)) @ np.array(self.along or (0.0, 0.0, 0.0))
         return np.array([*along, *self.position, *self.target])
 
     @property
@@ -258,8 +255,7 @@ class Points(ToolSensor):
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
         """Positions of the target in K postures."""
         del at_zero
-        poses = frames[0]
-        targets = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.target)
+        targets = place_point(frames[0], self.target)
         direction = self.constants(robot)[:3]
         across = np.linalg.svd(direction[None])[2][-1]
         problems = [""] * len(targets)
@@ -280,7 +276,7 @@ def read_covariance(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Tr
             "is not positive definite; expected variances in µm² on its diagonal",
             where="covariance_um2",
         )
-    a, b, c = (_triple(row, UM**2) for row in matrix.tolist())
+    a, b, c = (triple(row, UM**2) for row in matrix.tolist())
     return a, b, c
 
 
@@ -307,18 +303,8 @@ def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
     u, _, vh = np.linalg.svd(seen.T @ true)
     rotation = vh.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vh.T @ u.T))]) @ u.T
     position = targets.mean(axis=0) - rotation @ points.mean(axis=0)
-    return _triple(position.tolist()), _triple(pin.log3(rotation).tolist())
-
-
-def rotation_matrix(vector: Sequence[float]) -> Array:
-    """Rotation matrix of a rotation vector, shape (3, 3)."""
-    return np.asarray(pin.exp3(np.array(vector)))
+    return triple(position.tolist()), triple(pin.log3(rotation).tolist())
 
 
 def _unit(i: int) -> Triple:
-    return _triple(np.eye(3)[i].tolist())
-
-
-def _triple(values: Sequence[float], unit: float = 1.0) -> Triple:
-    x, y, z = (float(v) * unit + 0.0 for v in values)
-    return x, y, z
+    return triple(np.eye(3)[i].tolist())

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View
+from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View, triple
 from orthocal.sensors.tool_indicator import (
     ALIGNMENT_STD,
     LENGTH_MM,
@@ -30,7 +30,7 @@ from orthocal.sensors.tool_indicator import (
     Point,
     ToolIndicator,
 )
-from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
+from orthocal.units import MM, MRAD, read_tolerance, show_tolerance, to_mm
 
 TRIGGER_STD = 0.5 * MM
 """Prior standard deviation of the trigger height, [m]."""
@@ -51,8 +51,8 @@ class ProbeKeys(SetupKeys):
 
     direction: Literal["x", "y", "z", "-x", "-y", "-z"] = "-z"
     surface: Literal["plane"] | SurfaceKeys = "plane"
-    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT_STD) / MRAD
-    trigger_tolerance_mm: Millimetres = show_limit(TRIGGER_STD) / MM
+    direction_tolerance_mrad: Milliradians = show_tolerance(ALIGNMENT_STD, MRAD)
+    trigger_tolerance_mm: Millimetres = show_tolerance(TRIGGER_STD, MM)
     """Tolerance of the trigger height."""
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Tip of the probe, from the tool centre point, in the tool's frame."""
@@ -76,19 +76,17 @@ class Probe(ToolIndicator):
     @classmethod
     def from_keys(cls, keys: Any) -> Probe:  # noqa: ANN401 - of `keys`
         """Build from the keys of a session.yaml."""
-        direction_std = tidy(read_limit(keys.direction_tolerance_mrad) * MRAD)
-        surface = Artefact("plate", direction_std=direction_std, form_degree=FORM_DEGREE)
-        if isinstance(keys.surface, SurfaceKeys):
-            surface = Artefact(
-                "plate",
-                length=keys.surface.length_mm * MM,
-                direction_std=direction_std,
-                form_std=tidy(read_limit(keys.surface.flat_tolerance_mm) * MM),
-                form_degree=FORM_DEGREE,
-            )
-        x, y, z = (v * MM for v in keys.tool_mm)
-        trigger = tidy(read_limit(keys.trigger_tolerance_mm) * MM)
-        return cls(keys.direction, surface, (x, y, z), trigger_std=trigger)
+        flat = SurfaceKeys(flat_tolerance_mm=0.0)
+        surface = flat if keys.surface == "plane" else keys.surface
+        plate = Artefact(
+            "plate",
+            length=surface.length_mm * MM,
+            direction_std=read_tolerance(keys.direction_tolerance_mrad, MRAD),
+            form_std=read_tolerance(surface.flat_tolerance_mm, MM),
+            form_degree=FORM_DEGREE,
+        )
+        trigger = read_tolerance(keys.trigger_tolerance_mm, MM)
+        return cls(keys.direction, plate, triple(keys.tool_mm, MM), trigger_std=trigger)
 
     def to_keys(self) -> dict[str, Any]:
         """Keys for a session.yaml."""
@@ -96,14 +94,14 @@ class Probe(ToolIndicator):
         surface: Any = "plane"
         if a.form_std:
             surface = {
-                "flat_tolerance_mm": tidy(show_limit(a.form_std) / MM),
+                "flat_tolerance_mm": show_tolerance(a.form_std, MM),
                 "length_mm": to_mm(a.length),
             }
         keys = {
             "direction": self.direction,
             "surface": surface,
-            "direction_tolerance_mrad": tidy(show_limit(a.direction_std) / MRAD),
-            "trigger_tolerance_mm": tidy(show_limit(self.trigger_std) / MM),
+            "direction_tolerance_mrad": show_tolerance(a.direction_std, MRAD),
+            "trigger_tolerance_mm": show_tolerance(self.trigger_std, MM),
         }
         return {**keys, **({"tool_mm": [to_mm(v) for v in self.tool]} if any(self.tool) else {})}
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 import casadi as ca
+import numpy as np
 from pydantic import Field
 
 from orthocal.arguments import require_names
@@ -21,9 +22,11 @@ from orthocal.effects.protocol import Condition
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name
 from orthocal.kinematics.symbolic import Pose
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, require_tcp
 from orthocal.robot.parameters import require_prior
 from orthocal.units import InUnit, Unit
+
+Value = TypeVar("Value")
 
 GaugeZero = Literal["free", "known"]
 """Gauge zero of a setup: estimated from its readings, or known to be 0. With a known gauge zero the
@@ -39,6 +42,15 @@ DIMENSION_STEP = 1e-6
 
 LARGEST_READING = 0.3
 """Largest reading of an indicator, [m]; no leg is as far from parallel."""
+
+
+Triple = tuple[float, float, float]
+
+
+def triple(values: Sequence[float] | Array, unit: float = 1.0) -> Triple:
+    """Three numbers in a unit, in SI."""
+    x, y, z = (float(v) * unit + 0.0 for v in values)
+    return x, y, z
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,17 +295,35 @@ class ToolSensor:
         del robot
         return {}
 
+    def frames(self, robot: Robot) -> Frames:
+        """Frame of the tool."""
+        return Frames((require_tcp(robot).frame,))
+
+
+def place_point(poses: Array, point: Sequence[float] | Array) -> Array:
+    """Positions of a point that is fixed in a frame, shape (K, 3), [m].
+
+    Args:
+        poses: Poses of the frame, shape (K, 4, 4).
+        point: Coordinates in the frame, shape (3,), [m].
+    """
+    return np.asarray(poses[:, :3, 3] + poses[:, :3, :3] @ np.array(point))
+
+
+def _optional(sensor: Sensor, name: str, default: Value) -> Value:
+    """Attribute that a sensor need not have."""
+    value: Value = getattr(sensor, name, default)
+    return value
+
 
 def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:
     """Conditions of a reading on which a sensor's expression depends."""
-    conditions: tuple[Condition, ...] = getattr(sensor, "conditions", ())
-    return conditions
+    return _optional(sensor, "conditions", ())
 
 
 def tool_path(sensor: Sensor) -> ToolPath | None:
     """Path of the tool that a sensor prescribes; None for a straight one."""
-    path: ToolPath | None = getattr(sensor, "path", None)
-    return path
+    return _optional(sensor, "path", None)
 
 
 def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:
@@ -301,38 +331,33 @@ def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:
 
     None for an indicator on the base, whose instructions the sheet contains.
     """
-    steps: tuple[str, ...] | None = getattr(sensor, "mounting_steps", None)
-    return steps
+    return _optional(sensor, "mounting_steps", None)
 
 
 def largest_reading(sensor: Sensor) -> float:
     """Largest reading of a sensor, [m]; a larger one has a wrong unit."""
-    largest: float = getattr(sensor, "largest_reading", LARGEST_READING)
-    return largest
+    return _optional(sensor, "largest_reading", LARGEST_READING)
 
 
 def stated_dimensions(sensor: Sensor) -> Mapping[str, Sensor]:
     """Sensors with one dimension larger by DIMENSION_STEP, by the key of the dimension."""
-    dimensions: Mapping[str, Sensor] = getattr(sensor, "dimensions", {})
-    return dimensions
+    return _optional(sensor, "dimensions", {})
 
 
 def mirrored_parameters(sensor: Sensor) -> tuple[NuisanceParameter, ...]:
     """Nuisance parameters of a vector that readings may determine only up to a sign."""
-    names: tuple[str, ...] = getattr(sensor, "mirrored", ())
+    names: tuple[str, ...] = _optional(sensor, "mirrored", ())
     return tuple(p for p in sensor.nuisance_parameters if p.name in names) if names else ()
 
 
 def default_zero(sensor: Sensor) -> GaugeZero:
     """Gauge zero of setups that state none."""
-    zero: GaugeZero = getattr(sensor, "zero", "free")
-    return zero
+    return _optional(sensor, "zero", "free")
 
 
 def reads_pairs(sensor: Sensor) -> bool:
     """True if a reading belongs to a pair of postures; such a row is a single reading."""
-    pairs: bool = getattr(sensor, "reads_pairs", False)
-    return pairs
+    return _optional(sensor, "reads_pairs", False)
 
 
 def is_difference(minus: str | None, sensor: Sensor) -> bool:
@@ -347,14 +372,12 @@ def is_difference(minus: str | None, sensor: Sensor) -> bool:
 
 def states_readings(sensor: Sensor) -> bool:
     """True if readings are prescribed, not measured: the postures are."""
-    stated: bool = getattr(sensor, "states_readings", False)
-    return stated
+    return _optional(sensor, "states_readings", False)
 
 
 def equal_readings(sensor: Sensor) -> bool:
     """True if equal readings of different postures are no anomaly."""
-    equal: bool = getattr(sensor, "equal_readings", states_readings(sensor))
-    return equal
+    return _optional(sensor, "equal_readings", states_readings(sensor))
 
 
 WITH_DIAL = frozenset(("dial", "ball bar"))
@@ -368,5 +391,4 @@ def has_dial(sensor: Sensor) -> bool:
 
 def instrument(sensor: Sensor) -> str:
     """Noun for what shows a reading, such as dial or ball bar."""
-    noun: str = getattr(sensor, "instrument", "dial")
-    return noun
+    return _optional(sensor, "instrument", "dial")

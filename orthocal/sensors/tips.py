@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import casadi as ca
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from orthocal.io.documents import Keys, Number, PositiveNumber
+from orthocal.io.documents import Keys, Number, OneKey, PositiveNumber
 from orthocal.units import MM, to_mm
 
 LARGEST_TIP_MM = 100.0
@@ -89,19 +89,11 @@ class BladeKeys(Keys):
     """Radius of an edge that is a pin; 0 for a sharp edge."""
 
 
-class TipKeys(Keys):
+class TipKeys(OneKey):
     """Keys of a tip in a session.yaml: ball or blade."""
 
     ball: BallKeys | None = None
     blade: BladeKeys | None = None
-
-    @model_validator(mode="after")
-    def _require_one_form(self) -> TipKeys:
-        """Refuse both ball and blade, or none of them."""
-        if (self.ball is None) == (self.blade is None):
-            text = "none" if self.ball is None else "ball and blade"
-            raise ValueError(f"found {text}; expected one of ball, blade")
-        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +122,10 @@ class Tip:
     @staticmethod
     def from_keys(keys: TipKeys) -> Tip:
         """Build from the keys of a session.yaml."""
-        if keys.ball is not None:
-            return Tip("ball", keys.ball.radius_mm * MM)
-        blade = keys.blade or BladeKeys(width_mm=1.0)
-        return Tip("blade", blade.radius_mm * MM, blade.width_mm * MM)
+        form, tip = keys.stated
+        if form == "ball":
+            return Tip("ball", tip.radius_mm * MM)
+        return Tip("blade", tip.radius_mm * MM, tip.width_mm * MM)
 
     def to_keys(self) -> dict[str, dict[str, float]]:
         """Keys for a session.yaml."""

@@ -32,19 +32,20 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.direction import direction_vector
-from orthocal.sensors.mounting import SCALE, rotate
+from orthocal.sensors.mounting import SCALE, ScaleTolerance, rotate
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
-    Frames,
     NuisanceParameter,
     Sensor,
     SetupKeys,
     ToolSensor,
     View,
     default_zero,
+    place_point,
+    triple,
 )
-from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
+from orthocal.units import MM, MRAD, read_tolerance, show_tolerance, to_mm
 
 ALIGNMENT_STD = 5.0 * MRAD
 """Prior standard deviation of the direction of an artefact aligned by eye, [rad]."""
@@ -83,7 +84,7 @@ def flat_terms(degree: int) -> tuple[str, ...]:
 class _ArtefactKeys(Keys):
     """Keys of every artefact."""
 
-    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT_STD) / MRAD
+    direction_tolerance_mrad: Milliradians = show_tolerance(ALIGNMENT_STD, MRAD)
 
 
 class _EdgeKeys(_ArtefactKeys):
@@ -145,7 +146,7 @@ class ToolIndicatorKeys(SetupKeys):
     artefact: ArtefactKeys
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Tip of the plunger at reading 0, from the tool centre point, in the tool's frame."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=0.4)] = show_limit(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +202,7 @@ class ToolIndicator(ToolSensor):
             SessionError: If an edge is parallel to the plunger.
         """
         a = keys.artefact
-        fields: dict[str, Any] = {"direction_std": _std(a.direction_tolerance_mrad, MRAD)}
+        fields: dict[str, Any] = {"direction_std": read_tolerance(a.direction_tolerance_mrad, MRAD)}
         if isinstance(a, StraightedgeKeys | SquareKeys):
             if a.along == keys.direction.lstrip("-"):
                 raise SessionError(
@@ -212,22 +213,24 @@ class ToolIndicator(ToolSensor):
                 "along": a.along,
                 "name": a.name,
                 "length": a.length_mm * MM,
-                "form_std": _std(a.straight_tolerance_mm, MM),
+                "form_std": read_tolerance(a.straight_tolerance_mm, MM),
                 "reversed": a.reversed,
             }
             if isinstance(a, SquareKeys):
-                fields["square_std"] = _std(a.square_tolerance_mrad, MRAD)
+                fields["square_std"] = read_tolerance(a.square_tolerance_mrad, MRAD)
         elif isinstance(a, PlateKeys):
-            fields |= {"length": a.length_mm * MM, "form_std": _std(a.flat_tolerance_mm, MM)}
+            fields |= {
+                "length": a.length_mm * MM,
+                "form_std": read_tolerance(a.flat_tolerance_mm, MM),
+            }
         else:
             fields |= {
                 "height": a.height_mm * MM,
-                "height_std": _std(a.height_tolerance_mm, MM),
+                "height_std": read_tolerance(a.height_tolerance_mm, MM),
                 "table": a.table_mm * MM,
             }
-        x, y, z = (v * MM for v in keys.tool_mm)
-        artefact = Artefact(a.kind, **fields)
-        return cls(keys.direction, artefact, (x, y, z), read_limit(keys.scale_tolerance))
+        tool, artefact = triple(keys.tool_mm, MM), Artefact(a.kind, **fields)
+        return cls(keys.direction, artefact, tool, read_tolerance(keys.scale_tolerance))
 
     def to_keys(self) -> dict[str, Any]:
         """Keys for a session.yaml."""
@@ -238,23 +241,23 @@ class ToolIndicator(ToolSensor):
         if a.kind == "gauge_block":
             artefact |= {
                 "height_mm": to_mm(a.height),
-                "height_tolerance_mm": _limit(a.height_std, MM),
+                "height_tolerance_mm": show_tolerance(a.height_std, MM),
                 "table_mm": to_mm(a.table),
             }
         else:
             form = "flat" if a.kind == "plate" else "straight"
             artefact |= {"length_mm": to_mm(a.length)}
-            artefact |= {f"{form}_tolerance_mm": _limit(a.form_std, MM)}
+            artefact |= {f"{form}_tolerance_mm": show_tolerance(a.form_std, MM)}
         if a.kind == "square":
-            artefact["square_tolerance_mrad"] = _limit(a.square_std, MRAD)
+            artefact["square_tolerance_mrad"] = show_tolerance(a.square_std, MRAD)
         if a.reversed:
             artefact["reversed"] = True
-        artefact["direction_tolerance_mrad"] = _limit(a.direction_std, MRAD)
+        artefact["direction_tolerance_mrad"] = show_tolerance(a.direction_std, MRAD)
         keys: dict[str, Any] = {"direction": self.direction, "artefact": artefact}
         if any(self.tool):
             keys["tool_mm"] = [to_mm(v) for v in self.tool]
         if self.scale_std != SCALE:
-            keys["scale_tolerance"] = show_limit(self.scale_std)
+            keys["scale_tolerance"] = show_tolerance(self.scale_std)
         return keys
 
     def describe(self) -> str:
@@ -289,10 +292,6 @@ class ToolIndicator(ToolSensor):
             "Push the plunger in with a finger. The reading must grow. If it falls, enter "
             "every reading of this setup with the opposite sign.",
         )
-
-    def frames(self, robot: Robot) -> Frames:
-        """Frame of the tool."""
-        return Frames((require_tcp(robot).frame,))
 
     def constants(self, robot: Robot) -> Array:
         """Constants of the expression, shape (26,), [m].
@@ -382,8 +381,7 @@ class ToolIndicator(ToolSensor):
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
         """Positions of the plunger's tip in K postures."""
         del at_zero, robot
-        poses = frames[0]
-        tips = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.tool)
+        tips = place_point(frames[0], self.tool)
         d = direction_vector(self.direction)
         return Contact(
             tips,
@@ -450,13 +448,3 @@ def _legendre(degree: int, x: ca.SX) -> ca.SX:
     for n in range(degree):
         previous, current = current, ((2 * n + 1) * x * current - n * previous) / (n + 1)
     return current
-
-
-def _std(tolerance: float, unit: float) -> float:
-    """Standard deviation in SI units of a tolerance in a unit."""
-    return tidy(read_limit(tolerance) * unit)
-
-
-def _limit(std: float, unit: float) -> float:
-    """Tolerance in a unit of a standard deviation in SI units."""
-    return tidy(show_limit(std) / unit)

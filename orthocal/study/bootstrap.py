@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import Fit, fit_problem
@@ -59,8 +58,6 @@ class BootstrapStudy(Study):
         problem = fit.problem  # with the noise of each gauge
         return _Prepared(
             fit=fit,
-            values=problem.values,
-            fitted=fit.prediction,
             residuals=_rescaled_residuals(fit),
             cycles=find_cycles(session, problem.observations) if self.by == "cycles" else (),
             program=BatchSolver(problem, options=fit.program.options),
@@ -81,25 +78,22 @@ class _Prepared:
     """Data shared by all draws."""
 
     fit: Fit
-    values: Array
-    """Single readings, shape (n_entries,), [m of the first gauge]."""
-    fitted: Array
-    """Fitted readings with gauge zeros of 0, shape (n_entries,), [m of the first gauge]."""
     residuals: Array
     """Residuals rescaled to the noise, with mean 0, shape (n,), [m of the first gauge]."""
-    cycles: tuple[tuple[NDArray[np.int64], ...], ...]
+    cycles: tuple[tuple[Indices, ...], ...]
     """Entries of each cycle of each setup, with the same order of places in all cycles."""
     program: BatchSolver
 
     def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
         """Resampled readings of the session, shape (n_entries,), [m of the first gauge]."""
+        fitted, measured = self.fit.prediction, self.fit.problem.values
         if by == "residuals":
-            return np.asarray(self.fitted + rng.choice(self.residuals, size=self.fitted.size))
-        values = np.array(self.values)
+            return np.asarray(fitted + rng.choice(self.residuals, size=fitted.size))
+        values = np.array(measured)
         for cycles in self.cycles:
             drawn = rng.integers(len(cycles), size=len(cycles))
             for entries, k in zip(cycles, drawn, strict=True):
-                values[entries] = self.values[cycles[k]]
+                values[entries] = measured[cycles[k]]
         return values
 
 
@@ -137,9 +131,7 @@ def build_bootstrap_study(
     return study
 
 
-def find_cycles(
-    session: Session, observations: Observations
-) -> tuple[tuple[NDArray[np.int64], ...], ...]:
+def find_cycles(session: Session, observations: Observations) -> tuple[tuple[Indices, ...], ...]:
     """Entries of each cycle of each setup.
 
     Raises:

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.arguments import require_kind, require_names
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError, ParameterError, SolverError
 from orthocal.estimation.fit import require_determined
 from orthocal.estimation.linear import (
@@ -41,8 +40,6 @@ from orthocal.study.random_machines import NO_CONTACT, NOT_ASSEMBLED
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once, require_counts
 from orthocal.units import MM
-
-Flags = NDArray[np.bool_]
 
 IDENTIFIED = "identified"
 
@@ -199,8 +196,8 @@ class _Prepared:
         }
 
     def _iterate(
-        self, readings: Array, first_order: Array, errors: Array, measurable: Flags
-    ) -> tuple[NDArray[np.int64], list[Array], Array]:
+        self, readings: Array, first_order: Array, errors: Array, measurable: Mask
+    ) -> tuple[Indices, list[Array], Array]:
         """Undamped Gauss-Newton iterations, of which the first-order solution is the first step.
 
         Returns:
@@ -227,7 +224,7 @@ class _Prepared:
                 exact[i] = self.program.solve(sigma=1e-6, values=readings[i]).theta
         return steps, iterates, exact
 
-    def step(self, readings: Array, theta: Array) -> tuple[Array, Flags]:
+    def step(self, readings: Array, theta: Array) -> tuple[Array, Mask]:
         """One Gauss-Newton step for each machine; NaN if its readings cannot be predicted.
 
         Args:
@@ -355,10 +352,11 @@ def build_linearisation_study(
 
 def _idealise(session: Session) -> Session:
     """Session with readings of 0 and exact mountings."""
-    setups = {
-        name: replace(setup, sensor=_without_mounting_errors(setup.sensor))
-        for name, setup in session.setups.items()
-    }
+    setups = dict(session.setups)
+    for name, setup in setups.items():
+        sensor: Any = setup.sensor
+        if hasattr(sensor, "mounting"):
+            setups[name] = replace(setup, sensor=replace(sensor, mounting=EXACT))
     return replace(session, setups=setups).with_values(np.zeros(len(session.readings)))
 
 
@@ -398,10 +396,6 @@ def _largest_difference(values: Array, problem: CalibrationProblem) -> Array:
         for z in np.unique(o.zero)
     ]
     return np.asarray(np.max(sizes, axis=0))
-
-
-def _without_mounting_errors(sensor: Any) -> Any:  # noqa: ANN401 - any sensor with a mounting
-    return replace(sensor, mounting=EXACT) if hasattr(sensor, "mounting") else sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)

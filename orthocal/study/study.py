@@ -14,10 +14,10 @@ from operator import attrgetter
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
+from orthocal.arrays import Array
 from orthocal.effects.loading import load_robot_content, with_adjustments, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
@@ -152,7 +152,7 @@ def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
 
 
 def columns_in_edge_units(
-    prefix: str, problem: CalibrationProblem, values: NDArray[np.float64]
+    prefix: str, problem: CalibrationProblem, values: Array
 ) -> dict[str, Sequence[float]]:
     """Columns of parameters in the units that users read, which are a suffix of the names.
 

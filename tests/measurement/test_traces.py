@@ -195,7 +195,7 @@ def test_bins_with_few_samples_are_counted(plan, machine, tmp_path):
 @pytest.mark.parametrize(
     ("text", "problem", "line"),
     [
-        ("x_mm,y_mm,reading_mm\n1,2,3\n", "expected x_mm, y_mm, z_mm, reading_mm", ":1"),
+        ("x_mm,y_mm,reading_mm\n1,2,3\n", "'z_mm' is missing", ":1"),
         ("x_mm,y_mm,z_mm,reading_mm\n1,2,3\n", "has 3 fields; expected 4", ":2"),
         ("x_mm,y_mm,z_mm,reading_mm\n1,2,3,a\n", "reading_mm", ":2"),
         ("x_mm,y_mm,z_mm,reading_mm\n1,2,3,4\n", "has 1 samples", "t.csv"),

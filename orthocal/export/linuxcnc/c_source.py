@@ -27,7 +27,7 @@ from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
 from orthocal.robot.model import Drive
 from orthocal.text import comment_safe
-from orthocal.units import DRIVE_UNITS, MM, UM
+from orthocal.units import MM, UM
 
 LONGEST_LINE = 90
 
@@ -46,11 +46,11 @@ def write_core(
     """
     drives, inverse = calibration.robot.drives, approximation.inverse
     polynomial = inverse.correction
-    to_joints = np.array([d.direction / DRIVE_UNITS[d.unit][1] for d in drives])
+    to_joints = np.array([d.direction / d.joint_size for d in drives])
     common = {
         "robot": comment_safe(calibration.robot.name),
         "joints": ", ".join(comment_safe(d.name) for d in drives),
-        "joint_units": " and ".join(dict.fromkeys(DRIVE_UNITS[d.unit][0] for d in drives)),
+        "joint_units": " and ".join(dict.fromkeys(d.joint_unit for d in drives)),
         "drives": len(drives),
     }
     screws = _write_screws(calibration, homes)
@@ -104,7 +104,7 @@ def _write_thermal(change: ThermalChange | None, to_joints: Array) -> dict[str, 
 def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[str, object]:
     """Values of the template: periodic errors of the screws, and trims of the joints at home."""
     drives, active = calibration.robot.drives, calibration.active_offsets
-    units = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
+    units = np.array([d.joint_size for d in drives])
     directions = np.array([d.direction for d in drives])
     at_zero = np.array([d.to_joint(v) for d, v in zip(drives, active, strict=True)])
     home = [h.compensation.trim_at_home(h.old) - h.was.trim_at_home(h.old) for h in homes]
@@ -128,7 +128,7 @@ def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[
 def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) -> str:
     """C source of the nominal form in joints, with the active offsets of the controller."""
     directions = np.array([d.direction for d in drives])
-    units = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
+    units = np.array([d.joint_size for d in drives])
 
     def joints(coordinates: Array) -> Array:
         values = zip(drives, coordinates + active, strict=True)

@@ -135,25 +135,6 @@ class JointCompensation(JointTrim):
         return float(self(np.array([home or 0.0]))[0, 0 if positive else 1])
 
 
-def require_latched(robot: Robot, latched: Sequence[int] | None) -> tuple[int, ...]:
-    """Directions in which homing latches the switches, 1 or -1; 1 if not stated.
-
-    Raises:
-        ParameterError: If the numbers of directions and drives differ.
-    """
-    drives = robot.drives
-    if latched is None:
-        return (1,) * len(drives)
-    if len(latched) != len(drives):
-        names = ", ".join(d.name for d in drives)
-        raise ParameterError(
-            f"found {len(latched)} signs; expected the sign of HOME_LATCH_VEL of each joint "
-            f"({names}), such as +,+,-",
-            where="--latched",
-        )
-    return tuple(latched)
-
-
 def find_active_compensation(
     calibration: Calibration, latched: Sequence[int] | None
 ) -> tuple[JointCompensation, ...]:
@@ -162,7 +143,15 @@ def find_active_compensation(
     Raises:
         ParameterError: If the numbers of directions and drives differ.
     """
-    signs = require_latched(calibration.robot, latched)
+    drives = calibration.robot.drives
+    signs = (1,) * len(drives) if latched is None else tuple(latched)
+    if len(signs) != len(drives):
+        names = ", ".join(d.name for d in drives)
+        raise ParameterError(
+            f"found {len(signs)} signs; expected the sign of HOME_LATCH_VEL of each joint "
+            f"({names}), such as +,+,-",
+            where="--latched",
+        )
     trims = calibration.session.compensation or (JointTrim(),) * len(signs)
     return tuple(
         JointCompensation(trim.backlash, trim.table, sign)

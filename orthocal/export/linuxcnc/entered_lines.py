@@ -13,7 +13,6 @@ from orthocal.effects.compensation import Compensation, JointTrim, compensates_a
 from orthocal.errors import ExportError
 from orthocal.export.linuxcnc.drive_compensation import compensate_with_offsets
 from orthocal.robot.model import Drive
-from orthocal.units import DRIVE_UNITS
 
 SAME_OFFSET = 0.6e-6
 """Largest difference between equal offsets, [m, rad]: they are printed to 1 µm."""
@@ -69,7 +68,7 @@ def describe_other_lines(
     if offsets is not None and not states_offsets(offsets, entered):
         values = joined(
             [
-                f"{d.name} {_show(d, v, '+.3f')} instead of {_show(d, e, '+.3f')}"
+                f"{d.name} {d.show(v, '+.3f')} instead of {d.show(e, '+.3f')}"
                 for d, v, e in zip(calibration.robot.drives, offsets, entered.tolist(), strict=True)
                 if abs(v - e) > SAME_OFFSET
             ]
@@ -122,11 +121,5 @@ def _describe(drive: Drive, trim: JointTrim, other: JointTrim) -> str:
         return "another table" if other.table is not None else "a table (COMP_FILE)"
     if not trim.backlash:
         return "BACKLASH 0 or none"
-    alike = _show(drive, trim.backlash) == _show(drive, other.backlash)
-    return f"BACKLASH {_show(drive, trim.backlash, '.7f' if alike else '.3f')}"
-
-
-def _show(drive: Drive, value: float, form: str = ".3f") -> str:
-    """Value with its unit, mm or deg."""
-    unit, size = DRIVE_UNITS[drive.unit]
-    return f"{value / size:{form}} {unit}"
+    alike = drive.show(trim.backlash) == drive.show(other.backlash)
+    return f"BACKLASH {drive.show(trim.backlash, '.7f' if alike else '.3f')}"

@@ -22,7 +22,8 @@ from orthocal.assessment.controller_entries import find_entries, offsets_to_ente
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
 from orthocal.export.linuxcnc.drive_compensation import JointCompensation
-from orthocal.units import DRIVE_UNITS, Unit, format_fixed
+from orthocal.robot.model import Drive
+from orthocal.units import format_fixed
 
 SAME_POSITION = 1e-9
 """Largest difference between equal positions of a joint, [m, rad]."""
@@ -32,10 +33,7 @@ SAME_POSITION = 1e-9
 class JointHome:
     """HOME_OFFSET and soft limits of a joint."""
 
-    drive: str
-    unit: Unit
-    direction: int
-    """Sign of the joint's change if the drive coordinate grows, 1 or -1."""
+    drive: Drive
     change: float
     """Change of HOME_OFFSET, [unit]."""
     limit_change: float
@@ -80,19 +78,14 @@ class JointHome:
         return new.table is not old.table or abs(new.backlash - old.backlash) > SAME_POSITION
 
     @property
-    def joint_unit(self) -> str:
-        """Unit of the joint in LinuxCNC: mm or deg."""
-        return DRIVE_UNITS[self.unit][0]
-
-    @property
     def counting(self) -> str:
         """Direction in which the joint counts: up or down."""
-        return "up" if self.direction > 0 else "down"
+        return "up" if self.drive.direction > 0 else "down"
 
     def show(self, value: float, *, sign: bool = False) -> str:
         """Value in the joint's unit, to 0.1 µm or 1e-6 degrees, without a last zero."""
-        unit, size = DRIVE_UNITS[self.unit]
-        text = format_fixed(value / size, 4 if unit == "mm" else 6, sign=sign)
+        decimals = 4 if self.drive.unit == "m" else 6
+        text = format_fixed(value / self.drive.joint_size, decimals, sign=sign)
         return text.removesuffix("0")
 
 
@@ -143,9 +136,7 @@ def find_homes(
             home_changes[k] = change + old_trim - trim
         homes.append(
             JointHome(
-                drive=d.name,
-                unit=d.unit,
-                direction=d.direction,
+                drive=d,
                 change=home_changes[0],
                 limit_change=change,
                 old=home,

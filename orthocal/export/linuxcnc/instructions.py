@@ -30,7 +30,7 @@ from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
 from orthocal.robot.model import drive_keys
 from orthocal.text import comment_safe
-from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
+from orthocal.units import MM, UM
 
 UNSTATED = "those that were active, plus these changes"
 """Offsets of the drives if the session does not state the active ones."""
@@ -57,8 +57,8 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
         lines += [
             "",
             f"[JOINT_{i}]",
-            f"# {comment_safe(home.drive)}, counts {home.counting}: "
-            f"{home.show(home.change, sign=True)} {home.joint_unit}",
+            f"# {comment_safe(home.drive.name)}, counts {home.counting}: "
+            f"{home.show(home.change, sign=True)} {home.drive.joint_unit}",
             _line("HOME_OFFSET", home, home.new, home.change),
             *([] if stated else _opposite_line(home)),
             *_limit_lines(home, None if home.new is None else home.new_limits),
@@ -96,8 +96,8 @@ def write_module_lines(approximation: Approximation, homes: Sequence[JointHome])
             f"MAX_LIMIT = {millimetres([high])}",
         ]
     for i, home in enumerate(homes):
-        kind = "LINEAR" if home.unit == "m" else "ANGULAR"
-        lines += ["", f"[JOINT_{i}]", f"# {comment_safe(home.drive)}", f"TYPE = {kind}"]
+        kind = "LINEAR" if home.drive.unit == "m" else "ANGULAR"
+        lines += ["", f"[JOINT_{i}]", f"# {comment_safe(home.drive.name)}", f"TYPE = {kind}"]
         if home.old is not None:
             lines.append(f"HOME_OFFSET = {home.show(home.old)}")
         if home.limits is not None:
@@ -165,14 +165,15 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
     with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
     if with_backlash and not any(h.compensation_changes for h in homes):
         listed = ", ".join(
-            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.joint_unit}" for i, h in with_backlash
+            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.drive.joint_unit}"
+            for i, h in with_backlash
         )
         paragraphs.append(
             f"**Backlash:** {listed}, as during the measurement. Keep these lines BACKLASH."
         )
     elif with_backlash:
         listed = ", ".join(
-            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.joint_unit} (latched in "
+            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.drive.joint_unit} (latched in "
             f"{'+' if h.compensation.latched > 0 else '-'} direction)"
             for i, h in with_backlash
         )
@@ -238,50 +239,29 @@ def _describe_conditions(approximation: Approximation) -> str:
     return "".join(f"\n{paragraph}" for paragraph in paragraphs)
 
 
-def _describe_undetermined(calibration: Calibration) -> str:
-    """Paragraph about drives whose backlash does not change; empty without any."""
-    return _describe_unchanged(
-        calibration,
-        "Backlash",
-        [
-            (e.drive, expanded_uncertainty(calibration, e))
-            for e in find_backlash(calibration)
-            if not e.change
-        ],
-    )
-
-
-def _describe_undetermined_screws(calibration: Calibration) -> str:
-    """Paragraph about periodic errors that are not in the tables; empty without any."""
-    screws = [e for e in find_screws(calibration) if not e.change.any()]
-    return _describe_unchanged(
-        calibration, "Periodic error of the screw", [(e.drive, e.uncertainty) for e in screws]
-    )
-
-
-def _describe_unchanged(
-    calibration: Calibration, quantity: str, uncertainties: Sequence[tuple[str, float]]
-) -> str:
-    """Paragraph about drives whose compensation does not change; empty without any.
+def _describe_unchanged(calibration: Calibration, *, module: bool = False) -> str:
+    """Paragraphs about drives whose compensation does not change; empty without any.
 
     Args:
         calibration: The calibration.
-        quantity: Compensated quantity.
-        uncertainties: Drives, and the expanded uncertainty of each, [m, rad].
+        module: Whether a module corrects the periodic errors of the screws.
     """
-    joints = {d.name: (i, d) for i, d in enumerate(calibration.robot.drives)}
-    texts = []
-    for name, half in uncertainties:
-        i, drive = joints[name]
-        unit, size = DRIVE_UNITS[drive.unit]
-        texts.append(f"JOINT_{i} (±{format_fixed(half / size, 3)} {unit})")
-    if not texts:
-        return ""
-    listed = ", ".join(texts)
-    return (
-        f"\n**{quantity} unchanged, because its change is not determined or hardly lowers the tool "
-        f"error:** {listed}.\n"
-    )
+    backlash = [e for e in find_backlash(calibration) if not e.change]
+    screws = [e for e in find_screws(calibration) if not (module or e.change.any())]
+    uncertainties = {
+        "Backlash": [(e.drive, expanded_uncertainty(calibration, e)) for e in backlash],
+        "Periodic error of the screw": [(e.drive, e.uncertainty) for e in screws],
+    }
+    joints, paragraphs = {d.name: (i, d) for i, d in enumerate(calibration.robot.drives)}, ""
+    for quantity, of_drives in uncertainties.items():
+        numbered = [(*joints[name], half) for name, half in of_drives]
+        listed = ", ".join(f"JOINT_{i} (±{drive.show(half)})" for i, drive, half in numbered)
+        if listed:
+            paragraphs += (
+                f"\n**{quantity} unchanged, because its change is not determined or hardly lowers "
+                f"the tool error:** {listed}.\n"
+            )
+    return paragraphs
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
@@ -300,16 +280,16 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
             entered = f"present value {change}"
         else:
             entered = f"{home.show(home.old)} → **{home.show(home.new)}**"
-        expanded = round(half.get(home.drive, math.nan), ENTERED_DECIMALS)
+        expanded = round(half.get(home.drive.name, math.nan), ENTERED_DECIMALS)
         uncertainty = "" if math.isnan(expanded) else f"± {home.show(expanded)}"
         cells = (
             f"JOINT_{i}",
-            comment_safe(home.drive),
+            comment_safe(home.drive.name),
             home.counting,
             entered,
             change,
             uncertainty,
-            home.joint_unit,
+            home.drive.joint_unit,
         )
         rows.append(f"| {' | '.join(cells)} |")
     scope = "The calibration identified offsets of the drives only."
@@ -327,8 +307,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "table": "\n".join(rows),
         "active": f"`{_describe_offsets(calibration)}`" if stated_offsets else UNSTATED,
         "compensation": describe_compensation(homes, stated=stated)
-        + _describe_undetermined(calibration)
-        + _describe_undetermined_screws(calibration),
+        + _describe_unchanged(calibration),
     }
     return fill_template("home_offset.md", values)
 
@@ -380,10 +359,10 @@ def write_module_page(
         "nominal": nominal,
         "compensation": describe_compensation(homes, stated=stated, module=True)
         + _describe_conditions(approximation)
-        + _describe_undetermined(calibration),
+        + _describe_unchanged(calibration, module=True),
         "old_values": f" ({', '.join(old)})" if old else "",
         "last": len(homes) - 1,
-        "drives": ", ".join(comment_safe(h.drive) for h in homes),
+        "drives": ", ".join(comment_safe(h.drive.name) for h in homes),
         "others": ", ".join(letters),
         "beyond": beyond,
         "longer_mm": f"{LONGER_TOOL / MM:g}",

@@ -14,7 +14,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, parse_number
 from orthocal.io.files import read_lines
 from orthocal.robot.model import Robot
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import MM
 
 Block = tuple[list[str], Array]
 """File and line of some rows, for messages, and their values, shape (k, n_columns), [SI]."""
@@ -31,8 +31,7 @@ TOOL_COLUMNS = {"x_mm": MM, "y_mm": MM, "z_mm": MM}
 
 def drive_columns(robot: Robot) -> dict[str, float]:
     """Columns of drive coordinates and their factors to SI units."""
-    units = [DRIVE_UNITS[d.unit] for d in robot.drives]
-    return {f"{d.name}_{unit}": f for d, (unit, f) in zip(robot.drives, units, strict=True)}
+    return {f"{d.name}_{d.joint_unit}": d.joint_size for d in robot.drives}
 
 
 def read_points(path: Path, robot: Robot) -> Block:
@@ -59,7 +58,7 @@ def stream_joints(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterat
     Raises:
         SessionError: If the table or a row is wrong; names file and line.
     """
-    yield from _stream(source, drive_columns(robot), name=name)
+    yield from stream_columns(source, drive_columns(robot), name=name)
 
 
 def stream_points(
@@ -79,7 +78,7 @@ def stream_points(
     commanded = range(3) if robot.tcp is None else robot.tcp.coordinates
     columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in commanded}
     ignored = tuple(name for name in TOOL_COLUMNS if name not in columns)
-    yield from _stream(source, columns, ignored=ignored, name=name, most=most)
+    yield from stream_columns(source, columns, ignored=ignored, name=name, most=most)
 
 
 def format_rows(columns: dict[str, float], values: Array) -> str:
@@ -97,14 +96,26 @@ def format_rows(columns: dict[str, float], values: Array) -> str:
     )
 
 
-def _stream(
+def stream_columns(
     source: Path | BinaryIO,
     columns: dict[str, float],
     *,
-    ignored: tuple[str, ...] = (),
+    ignored: tuple[str, ...] | None = (),
     name: str,
     most: int | None = None,
 ) -> Iterator[Block]:
+    """Read columns of numbers block by block.
+
+    Args:
+        source: A file, or an open stream.
+        columns: Columns and their factors to SI units.
+        ignored: Columns that are ignored; None for all others.
+        name: Name of the source, for messages.
+        most: Largest number of rows; None for any number.
+
+    Raises:
+        SessionError: If the table or a row is wrong; names file and line.
+    """
     lines = read_lines(source, longest=LONGEST_LINE, name=name, error=SessionError)
     rows = csv_rows(
         lines,

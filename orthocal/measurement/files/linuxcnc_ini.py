@@ -18,7 +18,6 @@ from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
 from orthocal.measurement.files.session_keys import LARGEST_TRIM
 from orthocal.robot.model import Drive, Robot
-from orthocal.units import DRIVE_UNITS
 
 COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
@@ -64,8 +63,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     units = sections.get("TRAJ", {}).get("LINEAR_UNITS", "mm")
     if units not in METRIC_UNITS:
         raise ParameterError(f"LINEAR_UNITS is {units}; expected mm", where=f"{path}: [TRAJ]")
-    homes, latched, trims = list[float](), list[int | None](), list[JointTrim]()
-    limits = list[tuple[float, float]]()
+    joints = []
     for i, drive in enumerate(robot.drives):
         where = f"{path}: [JOINT_{i}]"
         keys = sections.get(f"JOINT_{i}")
@@ -74,16 +72,14 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
                 f"the section is missing; it belongs to drive {drive.name}", where=where
             )
         home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
-        homes.append(home)
-        limits.append(_read_limits(keys, drive, where))
-        latched.append(latch)
-        trims.append(trim)
+        joints.append((home, _read_limits(keys, drive, where), latch, trim))
+    homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
     return ControllerJoints(
-        tuple(homes),
-        tuple(limits),
+        homes,
+        limits,
         tuple(latch or 1 for latch in latched) if stated else None,
-        tuple(trims),
+        trims,
         None if stated else _read_offsets(path, robot.drives),
     )
 
@@ -96,11 +92,10 @@ def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | No
         values = {unit: [float(v) for v in text.split(",")] for unit, text in stated.items()}
     except ValueError:
         return None
-    units = [DRIVE_UNITS[d.unit] for d in drives]
-    names = [unit for unit, _ in units]
+    names = [d.joint_unit for d in drives]
     if {unit: len(v) for unit, v in values.items()} != {n: names.count(n) for n in names}:
         return None
-    return tuple(values[unit].pop(0) * size for unit, size in units)
+    return tuple(values[d.joint_unit].pop(0) * d.joint_size for d in drives)
 
 
 def _read_joint(
@@ -122,7 +117,7 @@ def _read_joint(
         key: parse_number(keys.get(key, "0"), where=where, name=key, error=ParameterError)
         for key in ("HOME_OFFSET", "HOME_LATCH_VEL", "BACKLASH", "COMP_FILE_TYPE")
     }
-    unit, factor = DRIVE_UNITS[drive.unit]
+    unit, factor = drive.joint_unit, drive.joint_size
     if not 0.0 <= numbers["BACKLASH"] <= LARGEST_TRIM:
         raise ParameterError(
             f"BACKLASH is {numbers['BACKLASH']:g} {unit}; expected 0 to {LARGEST_TRIM:g} {unit}",
@@ -147,14 +142,16 @@ def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[flo
     Raises:
         ParameterError: If one is no number, or the lowest is above the highest.
     """
-    unit, factor = DRIVE_UNITS[drive.unit]
+    factor = drive.joint_size
     low, high = (
         parse_number(keys[key], where=where, name=key, error=ParameterError) if key in keys else end
         for key, end in (("MIN_LIMIT", -math.inf), ("MAX_LIMIT", math.inf))
     )
     if low >= high:
         raise ParameterError(
-            f"MIN_LIMIT is {low:g} {unit}, not below MAX_LIMIT, {high:g} {unit}", where=where
+            f"MIN_LIMIT is {low:g} {drive.joint_unit}, not below MAX_LIMIT, "
+            f"{high:g} {drive.joint_unit}",
+            where=where,
         )
     return low * factor, high * factor
 
@@ -192,7 +189,7 @@ def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
     """
     if not name.strip() or "\0" in name:
         raise SessionError(f"found {name!r}; expected a file name", where=where)
-    file, (unit, factor) = folder / name, DRIVE_UNITS[drive.unit]
+    file, unit = folder / name, drive.joint_unit
     with content_withheld_outside(folder, file):
         text = read_text(file, error=SessionError)
         rows = list[list[float]]()
@@ -224,4 +221,4 @@ def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
             raise SessionError(
                 f"has {len(rows)} entries; expected 2 to {MAX_COMP_FILE_ENTRIES}", where=str(file)
             )
-    return read_only(np.array(rows) * factor)
+    return read_only(np.array(rows) * drive.joint_size)

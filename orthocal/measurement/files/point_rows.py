@@ -28,16 +28,15 @@ def split_points(session: Session) -> Session:
     """Session whose setups of points are split into three."""
     setups, gauges = {}, dict(session.gauges)
     for setup in session.setups.values():
-        if isinstance(setup.sensor, Points) and setup.sensor.along is not None:
-            setups[setup.name] = setup
-            continue
-        if "[" in setup.name or "]" in setup.name:
+        sensor = setup.sensor
+        is_split = isinstance(sensor, Points) and sensor.along is not None
+        if not is_split and ("[" in setup.name or "]" in setup.name):
             raise SessionError(
                 "has brackets; expected a name without them, because they name the coordinates of "
                 "points",
                 where=f"{session.path or 'session'}: setups.{setup.name}",
             )
-        if not isinstance(setup.sensor, Points):
+        if is_split or not isinstance(sensor, Points):
             setups[setup.name] = setup
             continue
         axis_setups, axis_gauges = split_setup(setup, session.gauges[setup.gauge])

@@ -10,11 +10,11 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
-from orthocal.io.documents import Count, Keys, Name, Number, PositiveNumber
+from orthocal.io.documents import Count, Keys, Name, Number, OneKey, PositiveNumber
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
-from orthocal.sensors.mounting import LARGEST_SCALE
-from orthocal.sensors.protocol import LARGEST_READING
+from orthocal.sensors.mounting import ScaleTolerance
+from orthocal.sensors.protocol import LARGEST_READING, triple
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit
@@ -85,7 +85,7 @@ class GaugeKeys(Keys):
     """Lowest and highest reading."""
     tip: TipKeys | None = None
     """Tip; a setup may override it."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] | None = None
+    scale_tolerance: ScaleTolerance | None = None
     """Tolerance of the scale factor, dimensionless; a setup may override it."""
 
     def to_gauge(self) -> Gauge:
@@ -104,7 +104,7 @@ class GaugeKeys(Keys):
         return self
 
 
-class PostureKeys(Keys):
+class PostureKeys(OneKey):
     """Keys of a posture: commanded tool coordinates or drive coordinates."""
 
     tcp_mm: Coordinates | None = None
@@ -113,23 +113,6 @@ class PostureKeys(Keys):
     """Drive coordinates of a robot with prismatic drives, in the order of the drives."""
     joints_deg: Coordinates | None = None
     """Drive coordinates of a robot with revolute drives, in the order of the drives."""
-
-    @model_validator(mode="after")
-    def _require_one_key(self) -> PostureKeys:
-        """Refuse a posture with several keys of coordinates, or with none."""
-        stated = self.model_dump(exclude_none=True)
-        if len(stated) != 1:
-            shown = " and ".join(stated) or "none"
-            raise ValueError(
-                f"found {shown}; expected one of {', '.join(PostureKeys.model_fields)}"
-            )
-        return self
-
-    @property
-    def coordinates(self) -> tuple[str, list[float]]:
-        """Key of the posture, and its coordinates in the key's unit."""
-        ((key, values),) = self.model_dump(exclude_none=True).items()
-        return key, values
 
 
 class FirmwareKeys(Keys):
@@ -161,17 +144,12 @@ class FirmwareKeys(Keys):
         return DeltaSettings(
             self.name,
             self.radius_mm * MM,
-            _scaled(self.rods_mm, MM),
-            _scaled(self.homed_mm, MM),
-            _scaled(self.angles_deg, DEG),
+            triple(self.rods_mm, MM),
+            triple(self.homed_mm, MM),
+            triple(self.angles_deg, DEG),
             self.tilts,
-            _scaled(self.probe_mm, MM),
+            triple(self.probe_mm, MM),
         )
-
-
-def _scaled(values: Three, factor: float) -> Three:
-    a, b, c = values
-    return a * factor, b * factor, c * factor
 
 
 class ControllerKeys(Keys):

@@ -41,8 +41,7 @@ def require_mechanical_zero(robot: Robot, where: str) -> None:
 
 def _state_zero(drive: Drive) -> str:
     """Key and value of the mechanical zero of a drive."""
-    unit, factor = DRIVE_UNITS[drive.unit]
-    return f"{drive.name}.zero_{unit}: {drive.zero / factor:.6g}"
+    return f"{drive.name}.zero_{drive.joint_unit}: {drive.zero / drive.joint_size:.6g}"
 
 
 def build_postures(
@@ -87,7 +86,7 @@ def build_postures(
 
 def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureForm, Array]:
     """Form and coordinates of a posture, shape (n_drives,), [m, rad]."""
-    key, values = keys.coordinates
+    key, values = keys.stated
     count = len(robot.drives)
     if key == "tcp_mm":
         if not robot.commands_tool:
@@ -140,10 +139,9 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, posture: str | Non
     prefix = "" if posture is None else f"in posture '{posture}' "
     for drive, value in zip(robot.drives, drives, strict=True):
         if drive.is_beyond(value):
-            unit, factor = DRIVE_UNITS[drive.unit]
-            number, low, high = (v / factor for v in (drive.to_joint(value), *drive.joint_limits))
+            low, high = drive.joint_limits
             raise SessionError(
-                f"{prefix}{drive.name} would be at {number:.3f} {unit}; it reaches from {low:g} to "
-                f"{high:g} {unit}",
+                f"{prefix}{drive.name} would be at {drive.show(float(drive.to_joint(value)))}; it "
+                f"reaches from {low / drive.joint_size:g} to {drive.show(high, 'g')}",
                 where=where,
             )

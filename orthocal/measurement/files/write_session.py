@@ -37,7 +37,7 @@ from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.points import base_name, gather_points, names_in_files
 from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session, Setup
-from orthocal.units import DEG, DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
+from orthocal.units import DEG, MM, tidy, to_mm, trim_zeros
 
 
 def session_document(session: Session) -> dict[str, Any]:
@@ -141,8 +141,8 @@ def _controller_document(session: Session) -> dict[str, Any]:
             document.setdefault(key, []).append(tidy(float(offset) / MM))
     if any(joint.backlash or joint.table is None for joint in session.compensation):
         for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
-            unit, factor = DRIVE_UNITS[drive.unit]
-            document.setdefault(f"backlash_{unit}", []).append(tidy(joint.backlash / factor))
+            backlash = tidy(joint.backlash / drive.joint_size)
+            document.setdefault(f"backlash_{drive.joint_unit}", []).append(backlash)
     if any(joint.table is not None for joint in session.compensation):
         document["comp_file"] = [
             None if joint.table is None else table_name(i)

@@ -392,10 +392,7 @@ def choose_columns(
         if indices:
             single[role] = indices[0]
         elif not optional.get(role, True):
-            raise SessionError(
-                f"no column has the role {role}; assign one by --column {role}=HEADING",
-                where=where,
-            )
+            raise _missing_column(role, where)
     lengths = LENGTHS if "posture" not in single else ("reading", *POINT)
     readings = {i: h for i, h in enumerate(headings) if h is not None and h.role in lengths}
     reading_columns = {i: h for i, h in readings.items() if h.role == "reading"}
@@ -418,10 +415,7 @@ def _check_points(texts: Sequence[str], columns: Mapping[int, Heading], where: s
         if len(indices) > 1:
             raise _several_columns(texts, indices, role, where)
         if not indices and has_points and role in POINT:
-            raise SessionError(
-                f"no column has the role {role}; assign one by --column {role}=HEADING",
-                where=where,
-            )
+            raise _missing_column(role, where)
     return has_points
 
 
@@ -430,9 +424,7 @@ def _check_readings(
 ) -> None:
     """Refuse missing and ambiguous columns of readings."""
     if not readings:
-        raise SessionError(
-            "no column has the role reading; assign one by --column reading=HEADING", where=where
-        )
+        raise _missing_column("reading", where)
     by_cycle: dict[int, list[int]] = {}
     for index, heading in readings.items():
         if heading.cycle is None:
@@ -455,6 +447,13 @@ def _check_readings(
             f"'{shorten(texts[cycle])}' as well; choose one by --column",
             where=where,
         )
+
+
+def _missing_column(role: str, where: str) -> SessionError:
+    """Error about a role without a column."""
+    return SessionError(
+        f"no column has the role {role}; assign one by --column {role}=HEADING", where=where
+    )
 
 
 def _several_columns(

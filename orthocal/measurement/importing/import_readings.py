@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 from orthocal.arguments import require_kind
-from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
@@ -181,14 +180,11 @@ def _read_long_table(
         unit=cast("UnitName | None", options.unit),
         separator_known=options.separator is not None,
         fill=options.fill,
-        points=_commanded_points(plan),
+        points={
+            n: p.values for n, p in plan.postures.items() if p.form == "tcp" and p.values.size == 3
+        },
     )
     return content, columns, long_table
-
-
-def _commanded_points(plan: Session) -> dict[str, Array]:
-    """Commanded points by posture, from the mechanical zero, shape (3,), [m]."""
-    return {n: p.values for n, p in plan.postures.items() if p.form == "tcp" and p.values.size == 3}
 
 
 def write_import(result: TableImport) -> None:

@@ -9,8 +9,6 @@ bin. A bin ends where the path reverses, because the approach changes.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +20,8 @@ from numpy.polynomial import Chebyshev
 
 from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
-from orthocal.io.documents import parse_number, read_text
-from orthocal.io.files import read_file
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.measurement.files.coordinate_tables import stream_columns
 from orthocal.measurement.files.readings_file import COORDINATES
 from orthocal.measurement.motion.approach import name_approach
 from orthocal.robot.model import Robot, require_tcp
@@ -33,9 +30,6 @@ from orthocal.units import MM
 
 MOST_SAMPLES = 500_000
 """Largest number of samples of a trace: eight minutes at 1 kHz."""
-
-LARGEST_TRACE = 64 * 2**20
-"""Largest size of a file, [bytes]."""
 
 FEWEST_SAMPLES = 8
 """Fewest samples of a bin, sufficient for a line and the noise about it."""
@@ -100,40 +94,15 @@ def read_trace(path: str | Path, robot: Robot) -> Trace:
         SessionError: If the file is wrong; names file and line.
     """
     file = Path(path)
-    content = read_file(file, error=SessionError, largest=LARGEST_TRACE)
-    text = read_text(file, error=SessionError, content=content)
-    rows = csv.reader(io.StringIO(text, newline=None), skipinitialspace=True)
-    header = [cell.strip() for cell in next(rows, [])]
-    required = [*(COORDINATES[c] for c in require_tcp(robot).coordinates), "reading_mm"]
-    if any(header.count(name) != 1 for name in required):
+    names = [*(COORDINATES[c] for c in require_tcp(robot).coordinates), "reading_mm"]
+    blocks = stream_columns(
+        file, dict.fromkeys(names, MM), ignored=None, name=str(file), most=MOST_SAMPLES + 1
+    )
+    table = np.concatenate([values for _, values in blocks])
+    if len(table) < FEWEST_SAMPLES:
         raise SessionError(
-            f"has the columns {', '.join(header)[:200]}; expected {', '.join(required)}, once each",
-            where=f"{file}:1",
+            f"has {len(table)} samples; expected {FEWEST_SAMPLES} or more", where=str(file)
         )
-    columns = [header.index(name) for name in required]
-    samples: list[list[float]] = []
-    try:
-        for row in rows:
-            if not any(cell.strip() for cell in row):
-                continue
-            where = f"{file}:{rows.line_num}"
-            if len(row) != len(header):
-                raise SessionError(f"has {len(row)} fields; expected {len(header)}", where=where)
-            samples.append(
-                [
-                    parse_number(row[i].strip(), where=where, name=header[i], error=SessionError)
-                    for i in columns
-                ]
-            )
-            if len(samples) > MOST_SAMPLES:
-                raise SessionError(f"has more than {MOST_SAMPLES} samples", where=str(file))
-    except csv.Error as e:
-        raise SessionError(f"is not valid CSV: {e}", where=f"{file}:{rows.line_num}") from None
-    if len(samples) < FEWEST_SAMPLES:
-        raise SessionError(
-            f"has {len(samples)} samples; expected {FEWEST_SAMPLES} or more", where=str(file)
-        )
-    table = MM * np.array(samples)
     return Trace(table[:, :-1], table[:, -1])
 
 
@@ -205,18 +174,13 @@ def _split_runs(points: Array, length: Array) -> list[slice]:
     ]
 
 
-def _count_bins(length: Array, run: slice, count: int) -> int:
-    """Number of bins of a run, with `count` bins per `LONGEST_BIN`."""
-    along = length[run]
-    return max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
-
-
 def _split_bins(length: Array, run: slice, count: int) -> list[Indices]:
     """Indices of the samples of each bin of a run, with `count` bins per `LONGEST_BIN`.
 
     Samples at rest, which do not advance along the path, are omitted.
     """
-    along, number = length[run], _count_bins(length, run, count)
+    along = length[run]
+    number = max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
     edges = along[0] + np.arange(1, number) / number * (along[-1] - along[0])
     moving = np.flatnonzero(np.diff(along, prepend=-1.0) > 0.0)
     bins = np.split(moving, np.searchsorted(along[moving], edges))

@@ -29,7 +29,7 @@ from orthocal.sensors.leg_indicator import BallIndicator
 from orthocal.sensors.protocol import Sensor, mounting_steps
 from orthocal.session.session import Session
 from orthocal.text import comment_safe, shorten
-from orthocal.units import DRIVE_UNITS, MM, format_fixed
+from orthocal.units import MM, format_fixed
 
 LETTERS = "XYZ"
 
@@ -290,7 +290,7 @@ def _words(robot: Robot, point: Array | None, options: ProgramOptions) -> str:
 def _joints(robot: Robot, stop: Stop) -> str:
     """Joints at a stop, as the controller displays them, in mm or degrees."""
     shown = zip(robot.drives, shown_joints(robot, stop.drives), strict=True)
-    return " ".join(format_fixed(float(v) / DRIVE_UNITS[d.unit][1], DECIMALS) for d, v in shown)
+    return " ".join(format_fixed(float(v) / d.joint_size, DECIMALS) for d, v in shown)
 
 
 def _label(stop: Stop) -> str:
