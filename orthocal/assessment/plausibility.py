@@ -123,14 +123,15 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
 
 
 def _coarser_step(values: Array, step: float) -> float:
-    """Largest step, ten times the stated one or more, of which all readings are multiples, [m].
+    """Largest power of ten times the stated step of which all readings are multiples, [m].
 
-    The stated step if a reading is no multiple, or if all are multiples by chance.
+    The stated step if a reading is no multiple of ten steps, or if all are multiples by chance.
     """
     nonzero = np.abs(values[values != 0.0]) / step
     while 10.0 ** -len(nonzero) < MISTAKE_PROBABILITY:
         coarser = nonzero / 10.0
-        if (np.abs(coarser - np.round(coarser)) > STEP_TOLERANCE).any():
+        whole = np.round(coarser)
+        if (whole == 0.0).any() or (np.abs(coarser - whole) > STEP_TOLERANCE).any():
             break
         nonzero, step = coarser, 10.0 * step
     return step

@@ -58,6 +58,18 @@ def test_readings_in_inches_are_found(session):
     assert [f.kind for f in found] == ["wrong unit"]
 
 
+def test_small_readings_in_metres_are_found():
+    """None of them is a hundredth of a step of the gauge."""
+    errors = {name: 0.1 * error for name, error in TRUTH.items()}
+    session = simulate_session(plan_of("workshop"), errors, seed=1).session
+    metres = session.with_values(np.round(session.values * 1e-3, 9))
+    assert not list(find_impossible_gauges(metres))
+    found = [f for f in judge_session(metres).findings if f.severity != "note"]
+    assert [(f.kind, f.text) for f in found] == [
+        ("wrong unit", "It looks as if all readings were written in m.")
+    ]
+
+
 def test_some_means_of_cycles_may_be_finer_than_the_dial(session):
     values = session.values.copy()
     values[::4] += 3e-6
