@@ -111,7 +111,7 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
         rows = _rows_of(session, name)
         coarser = _coarser_step(session.values[rows], step)
         if noise_floor(sigma, coarser) > MIN_EXCESS * noise_floor(sigma, step):
-            yield words.finer_than_readings(len(rows), step, coarser, of)
+            yield words.finer_than_readings(len(rows), step, coarser, of, noise_stated=bool(sigma))
         finer = _finer_rows(session, rows, gauge)
         if finer and (
             step > WRONG_UNIT_RATIO * sigma

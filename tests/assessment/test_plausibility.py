@@ -172,6 +172,10 @@ def test_a_resolution_of_a_tenth_of_the_readings_is_the_only_finding(cycles):
     (found,) = [f for f in judge_session(wrong).findings if f.severity != "note"]
     assert found.kind == "resolution too fine"
     assert found.numbers == pytest.approx({"resolution_mm": 0.001, "coarser_mm": 0.01})
+    assert "more scatter than its stated noise" in found.text
+    unstated = wrong.with_gauge(replace(wrong.gauge, sigma=None))
+    (found,) = find_impossible_gauges(unstated)
+    assert "stated noise" not in found.text
     rows = np.arange(5)  # five such readings may be by chance
     assert not list(find_impossible_gauges(wrong.select([wrong.readings[i] for i in rows])))
 

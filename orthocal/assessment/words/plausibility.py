@@ -217,12 +217,23 @@ def coarser_than_readings(
     )
 
 
-def finer_than_readings(total: int, step: float, coarser: float, of: GaugeKeys) -> Finding:
-    """Finding that all readings are multiples of a coarser step than the stated one, [m]."""
+def finer_than_readings(
+    total: int, step: float, coarser: float, of: GaugeKeys, *, noise_stated: bool
+) -> Finding:
+    """Finding that all readings are multiples of a coarser step than the stated one, [m].
+
+    Args:
+        total: Number of readings of the gauge.
+        step: Its stated resolution, [m].
+        coarser: Step of which the readings are multiples, [m].
+        of: The gauge.
+        noise_stated: Whether the noise of the gauge is stated.
+    """
+    noise = " Such rounding causes more scatter than its stated noise." if noise_stated else ""
     return review(
         "resolution too fine",
         f"{_stated_resolution(step, of)} all its {total} readings are multiples of "
-        f"{coarser / MM:g} mm. Such readings scatter more than the stated noise.",
+        f"{coarser / MM:g} mm.{noise}",
         f"State `resolution_mm: {coarser / MM:g}`, and the noise of this gauge in sigma_mm; or "
         "write all digits that the gauge shows.",
         resolution_mm=step / MM,
