@@ -282,8 +282,8 @@ def _coarse(session: Session, fit: Fit) -> Finding | None:
     repeated = noise.cycles_dof >= MIN_DOF
     scatter = noise.cycles_sigma if repeated else noise.residual_sigma
     dof = noise.cycles_dof if repeated else noise.residual_dof
-    if dof < MIN_DOF or not MIN_DIAL_SCATTER < WRONG_UNIT_RATIO * scatter < stated:
-        return None  # readings without any scatter were computed
+    if dof < MIN_DOF or scatter < MIN_DIAL_SCATTER or stated <= WRONG_UNIT_RATIO * scatter:
+        return None
     (name,) = session.gauges_with_readings
     return words.sigma_too_large(stated, _keys_of(session, name), scatter=scatter)
 
