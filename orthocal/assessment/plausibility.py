@@ -242,8 +242,9 @@ def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None
     observations = problem.observations
     values = problem.values * problem.noise_ratio
     expected = problem.predict(problem.active_theta) * problem.noise_ratio
-    readings, deviations = (
-        observations.rows(project_out_zeros(v, observations)) for v in (values, values - expected)
+    readings, predictions, deviations = (
+        observations.rows(project_out_zeros(v, observations))
+        for v in (values, expected, values - expected)
     )
     measured, deviation = _rms(readings), _rms(deviations)
     if deviation < MIN_WRONG_MACHINE or deviation < WRONG_MACHINE_RATIO * measured:
@@ -253,7 +254,7 @@ def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None
     if np.abs(deviations[worst]) > HALF_OF_SQUARES * np.linalg.norm(deviations) and others:
         rest = session.select(others)
         return _dimensions(rest, build_problem(rest, model="offsets"))
-    return words.wrong_dimensions(describe_legs(session.robot), deviation, measured)
+    return words.wrong_dimensions(describe_legs(session.robot), _rms(predictions), measured)
 
 
 def _too_small(session: Session, fit: Fit) -> Finding | None:

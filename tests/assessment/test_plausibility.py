@@ -114,6 +114,14 @@ def test_postures_of_a_machine_of_other_dimensions_are_found(tmp_path, plan, ses
     found = judge_session(other.with_values(values))
     assert found.findings[0].kind == "wrong dimensions"
     assert found.verdict == "reject"
+    nominal = simulate_session(other, {}, exact=True).session.values
+    setups = np.array([r.setup for r in other.readings])
+    for motion, name in ((nominal, "nominal_rms_mm"), (np.array(values), "measured_rms_mm")):
+        centred = np.array(motion)
+        for setup in other.setups:
+            centred[setups == setup] -= centred[setups == setup].mean()
+        expected = 1e3 * np.sqrt(np.mean(centred**2))
+        assert found.findings[0].numbers[name] == pytest.approx(expected)
 
 
 def test_a_line_with_the_name_of_another_setup_is_not_another_machine():
