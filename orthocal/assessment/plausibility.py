@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, Place
@@ -296,29 +296,38 @@ def _check_distances(session: Session) -> Finding | None:
     coordinates, first = np.unique(drives, axis=0, return_index=True)
     if len(coordinates) < 3:
         return None
-    distances = _nearest_distances(coordinates)
-    largest = float(np.linalg.norm(np.ptp(coordinates, axis=0)))
+    units = [d.unit for d in session.robot.drives]
+    columns = {u: [unit == u for unit in units] for u in units}
+    spans = {u: _largest_distance(coordinates[:, c]) for u, c in columns.items()}
+    scale = np.array([spans[u] or 1.0 for u in units])  # drives in mm and in deg are comparable
+    neighbours, distances = _nearest(coordinates / scale)
     zero = session.robot.drive_zero - session.active_offsets
-    distances_from_zero = np.linalg.norm(coordinates - zero, axis=1)
-    too_near = np.flatnonzero(
-        np.maximum(distances, distances_from_zero) < SAME_POSTURE_RATIO * largest
-    )
+    distances_from_zero = np.linalg.norm((coordinates - zero) / scale, axis=1)
+    too_near = np.flatnonzero(np.maximum(distances, distances_from_zero) < SAME_POSTURE_RATIO)
     if not too_near.size:
         return None
     last = too_near[first[too_near].argmax()]
     name = list(session.postures)[int(first[last])]
-    return words.postures_too_near(name, float(distances[last]), largest)
+    gap = coordinates[last] - coordinates[neighbours[last]]
+    gaps = {u: (float(np.linalg.norm(gap[c])), spans[u]) for u, c in columns.items()}
+    return words.postures_too_near(name, gaps)
 
 
-def _nearest_distances(points: Array) -> Array:
-    """Distance of each point from its nearest neighbour, shape (n,) of points (n, n_drives)."""
+def _largest_distance(points: Array) -> float:
+    """Diagonal of the box around points, shape (n, n_drives)."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _nearest(points: Array) -> tuple[Indices, Array]:
+    """Nearest neighbour of each point and its distance, shapes (n,) of points (n, n_drives)."""
     if len(points) > MANY_POSTURES:
         from scipy.spatial import KDTree
 
-        return np.asarray(KDTree(points).query(points, k=2)[0])[:, 1]
+        distances, neighbours = KDTree(points).query(points, k=2)
+        return np.asarray(neighbours)[:, 1], np.asarray(distances)[:, 1]
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distances, np.inf)
-    return np.asarray(distances.min(axis=1))
+    return distances.argmin(axis=1), distances.min(axis=1)
 
 
 def _legs(robot: Robot) -> Finding | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import plans
@@ -16,7 +17,13 @@ from models import TRUTH
 
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.plausibility import describe_legs, find_implausible, find_impossible_gauges
+from orthocal.assessment.plausibility import (
+    _check_distances,
+    _legs,
+    describe_legs,
+    find_implausible,
+    find_impossible_gauges,
+)
 from orthocal.assessment.words.effects import approach_incomplete
 from orthocal.assessment.words.plausibility import outstanding_error
 from orthocal.calibration.file import calibration_json
@@ -152,6 +159,14 @@ def test_legs_of_different_lengths_are_found(tmp_path):
     assert found.numbers == pytest.approx({"x_mm": 308.3, "y_mm": 310.25, "z_mm": 310.25})
 
 
+def test_equal_legs_without_errors_of_their_frames_do_not_differ(cycles):
+    robot = cycles.robot
+    names = [n for n, e in robot.parameters.elementary.items() if e.kind != "translation"]
+    parameters = SimpleNamespace(elementary={n: robot.parameters.elementary[n] for n in names})
+    rigid = SimpleNamespace(legs=robot.legs, drives=robot.drives, parameters=parameters)
+    assert _legs(rigid) is None
+
+
 @pytest.mark.parametrize(
     ("gauge", "number"),
     [
@@ -262,6 +277,38 @@ def test_a_posture_in_metres_is_found(cycles):
     (found,) = [f for f in find_implausible(near(cycles, name, "zero")) if "near" in f.kind]
     assert found.numbers["gap_mm"] == pytest.approx(0.087, abs=0.001)
     assert found.places[0].posture in (name, "zero")
+
+
+def test_near_postures_are_described_in_the_units_of_their_drives(fivebar):
+    """A slide in m and a motor in rad are compared in their own travels."""
+    displacements = {"a": (0, 0), "b": (0.5, 0), "c": (0, 0.5), "d": (-0.4, 0.3), "e": (3e-4, 0)}
+
+    def find(units):
+        """Finding about postures of two drives with these units."""
+        drives = [replace(d, unit=u) for d, u in zip(fivebar.drives, units, strict=True)]
+        postures = {
+            n: SimpleNamespace(drives=fivebar.drive_zero + np.array(d))
+            for n, d in displacements.items()
+        }
+        session = SimpleNamespace(
+            robot=SimpleNamespace(drives=drives, drive_zero=fivebar.drive_zero),
+            active_offsets=np.zeros(2),
+            readings=(),
+            postures=postures,
+        )
+        session.select = lambda readings: session
+        return _check_distances(session)
+
+    gap, largest = np.degrees(3e-4), np.degrees(np.hypot(0.9, 0.5))
+    found = find(["rad", "rad"])
+    assert found.places[0].posture == "e"
+    assert found.numbers == pytest.approx({"gap_deg": gap, "largest_deg": largest})
+    assert "0.017 deg from another one; others are up to 59 deg apart" in found.text
+    found = find(["m", "rad"])
+    expected = {"gap_mm": 0.3, "largest_mm": 900.0, "gap_deg": 0.0, "largest_deg": np.degrees(0.5)}
+    assert found.numbers == pytest.approx(expected)
+    displacements["e"] = (3e-4, 0.02)  # near along the slide only
+    assert find(["m", "rad"]) is None
 
 
 def test_neighbouring_postures_far_from_the_mechanical_zero_are_plausible(cycles):

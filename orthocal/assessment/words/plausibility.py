@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from orthocal.assessment.wording import (
@@ -17,7 +17,7 @@ from orthocal.assessment.wording import (
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.robot.parameters import Parameter
 from orthocal.text import spans
-from orthocal.units import MM, UM, show_limit
+from orthocal.units import DRIVE_UNITS, MM, UM, Unit, show_limit
 
 
 def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
@@ -283,16 +283,27 @@ def sigma_too_large(
     )
 
 
-def postures_too_near(posture: str, gap: float, largest: float) -> Finding:
-    """Finding about a posture that is much closer to another one than the others, [m]."""
+def postures_too_near(posture: str, distances: Mapping[Unit, tuple[float, float]]) -> Finding:
+    """Finding about a posture that is much closer to another one than the others.
+
+    Args:
+        posture: Name of the posture.
+        distances: Unit of drives, mapped to the distance of the posture from the other one and to
+            the largest distance of postures, [unit].
+    """
+    shown = {
+        DRIVE_UNITS[unit][0]: [value / DRIVE_UNITS[unit][1] for value in values]
+        for unit, values in distances.items()
+    }
+    near = joined([f"{gap:.2g} {unit}" for unit, (gap, _) in shown.items()])
+    apart = joined([f"{largest:.0f} {unit}" for unit, (_, largest) in shown.items()])
     return review(
         "postures too near",
-        f"Posture '{posture}' is {gap / MM:.2g} mm from another one. Others are up to "
-        f"{largest / MM:.0f} mm apart.",
-        "Make sure that its coordinates are in mm, not in metres.",
+        f"Posture '{posture}' is {near} from another one; others are up to {apart} apart.",
+        "Make sure that its coordinates are in the stated unit, such as mm, not in metres.",
         (Place(posture=posture),),
-        gap_mm=gap / MM,
-        largest_mm=largest / MM,
+        **{f"gap_{unit}": gap for unit, (gap, _) in shown.items()},
+        **{f"largest_{unit}": largest for unit, (_, largest) in shown.items()},
     )
 
 
