@@ -338,7 +338,7 @@ def _legs(robot: Robot) -> Finding | None:
         return None
     errors = [e.name for e in robot.parameters.elementary.values() if e.kind == "translation"]
     tolerance = max((robot.parameters[n].prior_std for n in errors), default=0.0)
-    if max(lengths.values()) - min(lengths.values()) < SAME_LENGTH * tolerance:
+    if max(lengths.values()) - min(lengths.values()) <= SAME_LENGTH * tolerance:
         return None
     return words.legs_differ(describe_legs(robot), lengths)
 
