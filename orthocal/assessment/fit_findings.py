@@ -191,7 +191,7 @@ def _above_tolerances(calibration: Calibration) -> list[Finding]:
         for p in calibration.free
         if p.name in parameters.names
         and not parameters.are_rigid(p.name)
-        and abs(p.value) > UNUSUAL_ERROR * p.prior_std
+        and abs(p.value - p.mean) > UNUSUAL_ERROR * p.prior_std
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, times
+from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, signed, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
@@ -190,12 +190,17 @@ def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
 def effect_above_tolerance(parameter: ParameterEstimate) -> Finding:
     """Finding about an error of an effect, such as a backlash, far above its tolerance."""
     unit, factor = parameter.edge_unit, parameter.edge_factor
-    tolerance = show_limit(parameter.prior_std)
+    tolerance, error = show_limit(parameter.prior_std), parameter.value - parameter.mean
+    estimate = f"estimated to be {plain(parameter.value * factor)} {unit}"
+    if parameter.mean:
+        estimate += f", {signed(error * factor)} {unit} from its stated value"
     return note(
         "above tolerances",
-        f"{parameter.name} is estimated to be {plain(parameter.value * factor)} {unit}, "
-        f"{times(abs(parameter.value) / tolerance)} its tolerance. With so small a tolerance the "
-        "estimate is too small.",
+        f"{parameter.name} is {estimate}, {times(abs(error) / tolerance)} its tolerance. So small "
+        "a tolerance keeps the estimate too close to the stated value."
+        if parameter.mean
+        else f"{parameter.name} is {estimate}, {times(abs(error) / tolerance)} its tolerance. With "
+        "so small a tolerance the estimate is too small.",
         "Check this part of the machine. If it is so far off, state a larger tolerance and "
         "calibrate again.",
         parameter_places(parameter.name),
