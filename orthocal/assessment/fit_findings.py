@@ -197,11 +197,10 @@ def _above_tolerances(calibration: Calibration) -> list[Finding]:
 
 def _linearisation(calibration: Calibration) -> list[Finding]:
     """Finding about the linearisation error, for the parameter with the largest part of its std."""
-    if not calibration.solver.shows_linearisation_error:
+    uncertain = [p for p in calibration.free if p.std > 0.0]  # at no bound, with a known std
+    if not (uncertain and calibration.solver.shows_linearisation_error):
         return []
-    p = max(calibration.free, key=lambda p: abs(p.value - p.linear) / max(p.std, 1e-300))
-    if math.isnan(p.std) or p.std <= 0.0:
-        return []
+    p = max(uncertain, key=lambda p: abs(p.value - p.linear) / p.std)
     return [words.linearisation_error(p, abs(p.value - p.linear), p.std)]
 
 
