@@ -34,8 +34,8 @@ STANDSTILL = 1e-6
 UNUSUAL_ERROR = 3.0
 """Error of an effect above which it is reported, [prior std]: 3 of 1000 are so large by chance."""
 
-NOTABLE_IDEALISATION = 1 / 3
-"""Error by idealisation, in standard deviations of a reading, above which it is reported."""
+NOTABLE_LINE_MODEL_ERROR = 1 / 3
+"""Error of the line model, in standard deviations of a reading, above which it is reported."""
 
 MAX_READINGS = 60
 """Largest number of compared readings, distributed over the session."""
@@ -72,7 +72,7 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
         *_above_tolerances(calibration),
         *_linearisation(calibration),
         *find_unresolved(calibration),
-        *_idealisation(calibration),
+        *_line_model_error(calibration),
     ]
 
 
@@ -213,25 +213,28 @@ def find_unresolved(calibration: Calibration) -> list[Finding]:
     return findings
 
 
-def _idealisation(calibration: Calibration) -> list[Finding]:
+def _line_model_error(calibration: Calibration) -> list[Finding]:
     """Finding about gauges that may touch a rod but are modelled by the centre line of the leg."""
     sigmas = {g.name: g.noise.sigma for g in calibration.gauges}
     session = restore_session(calibration)
     try:
-        idealised = find_idealised(session, sigmas)
+        error = find_line_model_error(session, sigmas)
     except (ClosureError, RobotError):  # reported by the finding about the tool error
         return []
-    if idealised is None:
+    if error is None:
         return []
-    sigma = sigmas[session.setups[idealised.setup].gauge]
-    if not idealised.size > NOTABLE_IDEALISATION * sigma:
+    sigma = sigmas[session.setups[error.setup].gauge]
+    if not error.size > NOTABLE_LINE_MODEL_ERROR * sigma:
         return []
-    return [words.line_assumed(idealised.size, idealised.setup, idealised.touches, sigma)]
+    return [words.line_assumed(error.size, error.setup, error.touches, sigma)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Idealised:
-    """Largest difference between the line model and a rod that the gauge may touch, in its σ."""
+class LineModelError:
+    """Largest difference between readings on the centre line and on a rod that the gauge may touch.
+
+    Differences of gauges are compared in standard deviations of their readings.
+    """
 
     setup: str
     """Setup with the largest difference."""
@@ -242,8 +245,8 @@ class Idealised:
     [m]."""
 
 
-def find_idealised(session: Session, sigmas: Mapping[str, float]) -> Idealised | None:
-    """Largest difference between readings of the line model and of a rod; None without such.
+def find_line_model_error(session: Session, sigmas: Mapping[str, float]) -> LineModelError | None:
+    """Largest error of the line model for gauges that may touch a rod; None without such gauges.
 
     Args:
         session: The session.
@@ -261,14 +264,20 @@ def find_idealised(session: Session, sigmas: Mapping[str, float]) -> Idealised |
     if not readings:
         return None
     part = replace(session.select(tuple(readings)), parts=())
-    rods = {name: next(iter(rod_sensors[name])) for name in part.setups}
-    setups = {n: replace(s, sensor=rod_sensors[n][rods[n]]) for n, s in part.setups.items()}
-    difference = _nominal_expansion(replace(part, setups=setups)) - _nominal_expansion(part)
-    sizes = np.linalg.norm(difference, axis=1)
+    line = _nominal_expansion(part)
     sigma = np.array([sigmas[session.setups[r.setup].gauge] for r in readings])
-    worst = int(np.nan_to_num(sizes / np.maximum(sigma, SMALLEST_SIGMA)).argmax())
-    setup = readings[worst].setup
-    return Idealised(setup, rods[setup], float(sizes[worst]))
+    candidates = []
+    for k in range(max(len(rod_sensors[name]) for name in part.setups)):
+        rods = {name: list(rod_sensors[name])[: k + 1][-1] for name in part.setups}
+        setups = {n: replace(s, sensor=rod_sensors[n][rods[n]]) for n, s in part.setups.items()}
+        difference = _nominal_expansion(replace(part, setups=setups)) - line
+        sizes = np.linalg.norm(difference, axis=1)
+        ratios = np.nan_to_num(sizes / np.maximum(sigma, SMALLEST_SIGMA))
+        worst = int(ratios.argmax())
+        setup = readings[worst].setup
+        found = LineModelError(setup, rods[setup], float(sizes[worst]))
+        candidates.append((float(ratios[worst]), found))
+    return max(candidates, key=lambda c: c[0])[1]
 
 
 def _nominal_expansion(session: Session) -> Array:

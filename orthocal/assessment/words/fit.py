@@ -256,16 +256,16 @@ def line_assumed(difference: float, setup: str, touches: str, sigma: float) -> F
     """Finding about a gauge that is modelled by the centre line of the leg, where there is no rod.
 
     Args:
-        difference: Difference of the readings on a rod, [m].
+        difference: Difference of the readings on the rod, [m].
         setup: Setup of the gauge.
-        touches: Value of `touches` for a rod.
+        touches: Name of the rod.
         sigma: Standard deviation of a reading, [m].
     """
     return note(
         "line assumed",
         "orthocal assumes that the gauge reads the centre line between the two rods of a leg. On "
-        f"a rod the readings differ by about {mm(difference)} mm (setup {setup}).",
-        f"If it touched a rod, state `touches: {touches}` and the gauge's `tip`.",
+        f"rod {touches} the readings differ by about {mm(difference)} mm (setup {setup}).",
+        f"If it touched a rod, state that rod (such as `touches: {touches}`) and its `tip`.",
         (Place(setup=setup),),
         off_line_mm=difference / MM,
         sigma_mm=sigma / MM,
