@@ -32,7 +32,7 @@ STANDSTILL = 1e-6
 """Change of a parameter, in prior standard deviations, below which it did not change."""
 
 UNUSUAL_ERROR = 3.0
-"""Error of an effect above which it is reported, [prior std]: 3 of 1000 are so large by chance."""
+"""Error of an effect above which it is reported, [prior std]; by chance 3 of 1000 are larger."""
 
 NOTABLE_LINE_MODEL_ERROR = 1 / 3
 """Error of the line model, in standard deviations of a reading, above which it is reported."""
@@ -87,10 +87,10 @@ def _redundancy(calibration: Calibration) -> list[Finding]:
 def _residuals(calibration: Calibration) -> list[Finding]:
     """Finding about the residuals in comparison with the noise, for the worst of the gauges."""
     findings = [_residuals_of(calibration, g) for g in calibration.gauges]
-    return sorted(findings, key=lambda f: (WORST_FIRST.index(f.kind), -_excess(f)))[:1]
+    return sorted(findings, key=lambda f: (WORST_FIRST.index(f.kind), -_mismatch(f)))[:1]
 
 
-def _excess(finding: Finding) -> float:
+def _mismatch(finding: Finding) -> float:
     """Ratio of the residuals to the noise, inverse if they are too small."""
     ratio = finding.numbers.get("ratio", 1.0)
     return max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf
@@ -99,7 +99,7 @@ def _excess(finding: Finding) -> float:
 def describe_gauge(calibration: Calibration, name: str) -> str:
     """Attribute for readings of a gauge, such as " of the gauge 'dial'"; "" if it is the only one.
 
-    The only gauge of one of several sessions is named by its session.
+    A session with a single gauge, one of several sessions, is named instead of its gauge.
     """
     if len(calibration.gauges) < 2:
         return ""
@@ -116,7 +116,7 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
     row_noun = "a difference" if calibration.rows_are_differences else "a reading"
     row_noun += of_gauge
 
-    def excess(reference: float, source: str) -> Finding:
+    def model_error(reference: float, source: str) -> Finding:
         return words.model_error(
             noise.residual_sigma,
             reference,
@@ -144,12 +144,12 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
             return words.fits(noise.cycles_sigma, REPEATED)
         return words.noise_from_cycles(noise.cycles_sigma)
     if noise.cycles_dof > 0:
-        return excess(noise.cycles_sigma, REPEATED)
+        return model_error(noise.cycles_sigma, REPEATED)
     if stated is None:
         return words.noise_from_residuals(noise.sigma * calibration.row_factor)
     if noise.exceeded_by_residuals(noise_floor(stated, gauge.resolution)):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
-        return excess(stated, f"the stated scatter of {noun}")
+        return model_error(stated, f"the stated scatter of {noun}")
     return words.fits(noise.residual_sigma, STATED)
 
 
@@ -166,7 +166,7 @@ def _standstill(calibration: Calibration) -> list[Finding]:
     if any(abs(p.value - p.start) > STANDSTILL * p.prior_std for p in calibration.free):
         return []
     if len(calibration.identifiability.below_noise) == len(calibration.free):
-        return [words.nothing_depends([p.name for p in calibration.free])]
+        return [words.no_sensitivity([p.name for p in calibration.free])]
     return [words.nothing_deviates(calibration.rms_before)]
 
 

@@ -1,4 +1,4 @@
-"""Findings about the parameters of a fit: beyond tolerances, at bounds, changed by linearisation."""
+"""Findings about the parameters of a fit: tolerances, bounds and linearisation."""
 
 from __future__ import annotations
 

@@ -151,11 +151,12 @@ def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
     )
 
 
-def nothing_depends(names: Sequence[str]) -> Finding:
-    """Finding that no reading depends on any free parameter."""
+def no_sensitivity(names: Sequence[str]) -> Finding:
+    """Finding that the effects of all free parameters on the readings are below the noise."""
     return note(
         "no sensitivity",
-        "No reading depends on any free parameter, so all keep their start values.",
+        "The effects of all free parameters on the readings are below the noise, so all keep "
+        "their start values.",
         "Read setups and postures that depend on the parameters.",
         parameter_places(*names),
     )
