@@ -60,9 +60,10 @@ class Choice:
 
     def __post_init__(self) -> None:
         require_kind(self.model, (str, type(None)), expected="the name of a model")
-        require_names(self.free, argument="free")
+        object.__setattr__(self, "free", require_names(self.free, argument="free"))
         if self.effects is not None:
-            require_names(self.effects, argument="effects")
+            effects = require_names(self.effects, argument="effects")
+            object.__setattr__(self, "effects", effects)
         require_numbers(self.known, argument="known", counts=(1, 2))
         require_numbers(self.tolerances, argument="tolerances")
         require_numbers(self.bounds, argument="bounds", counts=(2,))
