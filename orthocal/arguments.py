@@ -24,18 +24,17 @@ def require_kind(value: object, kinds: type | tuple[type, ...], *, expected: str
         raise TypeError(f"found a {type(value).__name__}; expected {expected}")
 
 
-def require_names(values: object, *, argument: str) -> None:
-    """Check that an argument is a list of texts.
+def require_names(values: object, *, argument: str) -> tuple[str, ...]:
+    """Texts of an argument, which may be an iterator.
 
     Raises:
-        TypeError: Naming the argument.
+        TypeError: Naming the argument, if it is not a list of texts.
     """
-    if (
-        isinstance(values, str)
-        or not isinstance(values, Iterable)
-        or not all(isinstance(v, str) for v in values)
-    ):
-        raise TypeError(f"{argument}: found {values!r}; expected a list of names or globs")
+    if isinstance(values, Iterable) and not isinstance(values, str):
+        names = tuple(values)
+        if all(isinstance(name, str) for name in names):
+            return names
+    raise TypeError(f"{argument}: found {values!r}; expected a list of names or globs")
 
 
 def require_numbers(values: object, *, argument: str, counts: tuple[int, ...] = (1,)) -> None:

@@ -150,6 +150,7 @@ def compare_models(
     gathered = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
+    models = require_names(models or (), argument="models")
     names, noises = _require_models(session, models), find_known_noises(session)
     if judgement is None:
         report("searching the readings for anomalies")
@@ -181,9 +182,8 @@ def compare_models(
 
 def _require_models(session: Session, models: Sequence[str]) -> Sequence[str]:
     """Names of models, by default all of the robot; unknown ones raise a ParameterError."""
-    require_names(models or (), argument="models")
     parameters = session.robot.parameters
-    for name in models or ():
+    for name in models:
         parameters.select_model(name)
     return models or parameters.models
 

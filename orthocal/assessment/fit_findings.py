@@ -32,10 +32,10 @@ STANDSTILL = 1e-6
 """Change of a parameter, in prior standard deviations, below which it did not change."""
 
 UNUSUAL_ERROR = 3.0
-"""Error of an effect above which it is reported, [prior std]: 3 of 1000 are so large by chance."""
+"""Error of an effect above which it is reported, [prior std]; by chance 3 of 1000 are larger."""
 
-NOTABLE_IDEALISATION = 1 / 3
-"""Error by idealisation, in standard deviations of a reading, above which it is reported."""
+NOTABLE_LINE_MODEL_ERROR = 1 / 3
+"""Error of the line model, in standard deviations of a reading, above which it is reported."""
 
 MAX_READINGS = 60
 """Largest number of compared readings, distributed over the session."""
@@ -72,7 +72,7 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
         *_above_tolerances(calibration),
         *_linearisation(calibration),
         *find_unresolved(calibration),
-        *_idealisation(calibration),
+        *_line_model_error(calibration),
     ]
 
 
@@ -87,10 +87,10 @@ def _redundancy(calibration: Calibration) -> list[Finding]:
 def _residuals(calibration: Calibration) -> list[Finding]:
     """Finding about the residuals in comparison with the noise, for the worst of the gauges."""
     findings = [_residuals_of(calibration, g) for g in calibration.gauges]
-    return sorted(findings, key=lambda f: (WORST_FIRST.index(f.kind), -_excess(f)))[:1]
+    return sorted(findings, key=lambda f: (WORST_FIRST.index(f.kind), -_mismatch(f)))[:1]
 
 
-def _excess(finding: Finding) -> float:
+def _mismatch(finding: Finding) -> float:
     """Ratio of the residuals to the noise, inverse if they are too small."""
     ratio = finding.numbers.get("ratio", 1.0)
     return max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf
@@ -99,7 +99,7 @@ def _excess(finding: Finding) -> float:
 def describe_gauge(calibration: Calibration, name: str) -> str:
     """Attribute for readings of a gauge, such as " of the gauge 'dial'"; "" if it is the only one.
 
-    The only gauge of one of several sessions is named by its session.
+    A session with a single gauge, one of several sessions, is named instead of its gauge.
     """
     if len(calibration.gauges) < 2:
         return ""
@@ -116,7 +116,7 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
     row_noun = "a difference" if calibration.rows_are_differences else "a reading"
     row_noun += of_gauge
 
-    def excess(reference: float, source: str) -> Finding:
+    def model_error(reference: float, source: str) -> Finding:
         return words.model_error(
             noise.residual_sigma,
             reference,
@@ -144,12 +144,12 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
             return words.fits(noise.cycles_sigma, REPEATED)
         return words.noise_from_cycles(noise.cycles_sigma)
     if noise.cycles_dof > 0:
-        return excess(noise.cycles_sigma, REPEATED)
+        return model_error(noise.cycles_sigma, REPEATED)
     if stated is None:
         return words.noise_from_residuals(noise.sigma * calibration.row_factor)
     if noise.exceeded_by_residuals(noise_floor(stated, gauge.resolution)):
         noun = "a difference" if calibration.rows_are_differences else "the gauge"
-        return excess(stated, f"the stated scatter of {noun}")
+        return model_error(stated, f"the stated scatter of {noun}")
     return words.fits(noise.residual_sigma, STATED)
 
 
@@ -166,7 +166,7 @@ def _standstill(calibration: Calibration) -> list[Finding]:
     if any(abs(p.value - p.start) > STANDSTILL * p.prior_std for p in calibration.free):
         return []
     if len(calibration.identifiability.below_noise) == len(calibration.free):
-        return [words.nothing_depends([p.name for p in calibration.free])]
+        return [words.no_sensitivity([p.name for p in calibration.free])]
     return [words.nothing_deviates(calibration.rms_before)]
 
 
@@ -191,17 +191,16 @@ def _above_tolerances(calibration: Calibration) -> list[Finding]:
         for p in calibration.free
         if p.name in parameters.names
         and not parameters.are_rigid(p.name)
-        and abs(p.value) > UNUSUAL_ERROR * p.prior_std
+        and abs(p.value - p.mean) > UNUSUAL_ERROR * p.prior_std
     ]
 
 
 def _linearisation(calibration: Calibration) -> list[Finding]:
     """Finding about the linearisation error, for the parameter with the largest part of its std."""
-    if not calibration.solver.shows_linearisation_error:
+    uncertain = [p for p in calibration.free if p.std > 0.0]  # at no bound, with a known std
+    if not (uncertain and calibration.solver.shows_linearisation_error):
         return []
-    p = max(calibration.free, key=lambda p: abs(p.value - p.linear) / max(p.std, 1e-300))
-    if math.isnan(p.std) or p.std <= 0.0:
-        return []
+    p = max(uncertain, key=lambda p: abs(p.value - p.linear) / p.std)
     return [words.linearisation_error(p, abs(p.value - p.linear), p.std)]
 
 
@@ -214,25 +213,28 @@ def find_unresolved(calibration: Calibration) -> list[Finding]:
     return findings
 
 
-def _idealisation(calibration: Calibration) -> list[Finding]:
+def _line_model_error(calibration: Calibration) -> list[Finding]:
     """Finding about gauges that may touch a rod but are modelled by the centre line of the leg."""
     sigmas = {g.name: g.noise.sigma for g in calibration.gauges}
     session = restore_session(calibration)
     try:
-        idealised = find_idealised(session, sigmas)
+        error = find_line_model_error(session, sigmas)
     except (ClosureError, RobotError):  # reported by the finding about the tool error
         return []
-    if idealised is None:
+    if error is None:
         return []
-    sigma = sigmas[session.setups[idealised.setup].gauge]
-    if not idealised.size > NOTABLE_IDEALISATION * sigma:
+    sigma = sigmas[session.setups[error.setup].gauge]
+    if not error.size > NOTABLE_LINE_MODEL_ERROR * sigma:
         return []
-    return [words.line_assumed(idealised.size, idealised.setup, idealised.touches, sigma)]
+    return [words.line_assumed(error.size, error.setup, error.touches, sigma)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Idealised:
-    """Largest difference between the line model and a rod that the gauge may touch, in its σ."""
+class LineModelError:
+    """Largest difference between readings on the centre line and on a rod that the gauge may touch.
+
+    Differences of gauges are compared in standard deviations of their readings.
+    """
 
     setup: str
     """Setup with the largest difference."""
@@ -243,8 +245,8 @@ class Idealised:
     [m]."""
 
 
-def find_idealised(session: Session, sigmas: Mapping[str, float]) -> Idealised | None:
-    """Largest difference between readings of the line model and of a rod; None without such.
+def find_line_model_error(session: Session, sigmas: Mapping[str, float]) -> LineModelError | None:
+    """Largest error of the line model for gauges that may touch a rod; None without such gauges.
 
     Args:
         session: The session.
@@ -262,14 +264,20 @@ def find_idealised(session: Session, sigmas: Mapping[str, float]) -> Idealised |
     if not readings:
         return None
     part = replace(session.select(tuple(readings)), parts=())
-    rods = {name: next(iter(rod_sensors[name])) for name in part.setups}
-    setups = {n: replace(s, sensor=rod_sensors[n][rods[n]]) for n, s in part.setups.items()}
-    difference = _nominal_expansion(replace(part, setups=setups)) - _nominal_expansion(part)
-    sizes = np.linalg.norm(difference, axis=1)
+    line = _nominal_expansion(part)
     sigma = np.array([sigmas[session.setups[r.setup].gauge] for r in readings])
-    worst = int(np.nan_to_num(sizes / np.maximum(sigma, SMALLEST_SIGMA)).argmax())
-    setup = readings[worst].setup
-    return Idealised(setup, rods[setup], float(sizes[worst]))
+    candidates = []
+    for k in range(max(len(rod_sensors[name]) for name in part.setups)):
+        rods = {name: list(rod_sensors[name])[: k + 1][-1] for name in part.setups}
+        setups = {n: replace(s, sensor=rod_sensors[n][rods[n]]) for n, s in part.setups.items()}
+        difference = _nominal_expansion(replace(part, setups=setups)) - line
+        sizes = np.linalg.norm(difference, axis=1)
+        ratios = np.nan_to_num(sizes / np.maximum(sigma, SMALLEST_SIGMA))
+        worst = int(ratios.argmax())
+        setup = readings[worst].setup
+        found = LineModelError(setup, rods[setup], float(sizes[worst]))
+        candidates.append((float(ratios[worst]), found))
+    return max(candidates, key=lambda c: c[0])[1]
 
 
 def _nominal_expansion(session: Session) -> Array:

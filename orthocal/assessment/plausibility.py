@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, Place
@@ -39,7 +39,8 @@ MIN_DOF = 5.0
 """Degrees of freedom below which a scatter is too uncertain to be judged."""
 
 WRONG_UNIT_RATIO = 30.0
-"""Ratio of stated noise to scatter or resolution above which the noise is in a wrong unit."""
+"""Ratio above which one of two lengths of a gauge is in a wrong unit: of the stated noise to the
+scatter or to the resolution, and of the resolution to the stated noise."""
 
 MIN_RANGE_STEPS = 10
 """Steps in the range of a gauge below which its resolution is in a wrong unit."""
@@ -54,16 +55,19 @@ MIN_DIAL_SCATTER = 1e-7
 """Scatter below which readings were computed, not read from a dial, [m]."""
 
 SAME_POSTURE_RATIO = 2e-3
-"""Ratio of a distance to the largest one below which two postures differ by a wrong unit."""
+"""Distance of a posture from the nearest one and from the mechanical zero, relative to the largest
+distance of postures, below which its coordinates seem to be in metres."""
 
-HALF_OF_SQUARES = 0.5**0.5
-"""Share of the norm of the deviations from which a single reading dominates them."""
+DOMINANT_SHARE = 0.5**0.5
+"""Ratio of one deviation to the norm of all above which it dominates: half the sum of squares."""
 
 MANY_POSTURES = 500
 """Number of postures above which a tree finds the nearest neighbours."""
 
 SAME_LENGTH = 5.0
 """Largest difference of lengths of equal legs, in prior standard deviations of a translation."""
+
+MM_PER_INCH = INCH / MM
 
 MISTAKE_PROBABILITY = 1e-6
 """Probability by chance below which readings on steps of an inch are a mistake."""
@@ -73,7 +77,7 @@ def find_implausible(session: Session, *, explained: bool = False) -> tuple[Find
     """Findings about units, dimensions, steps and noise.
 
     They depend on the readings and the robot alone, not on the calibrated model. Residuals are
-    those of a fit of offsets, which are larger than those of any larger model.
+    those of a fit of offsets. A larger model leaves residuals of at most this size.
 
     Args:
         session: The session.
@@ -95,42 +99,45 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
     Gauges without readings are not judged: no evidence depends on them.
     A noise of many times the resolution is in a wrong unit, and so is a resolution if the range has
     only a few steps. If readings are between steps, the resolution is wrong if it is many times the
-    noise, or if the readings span only a few steps. If all readings are multiples of ten steps, it
-    is wrong if such a rounding is larger than the stated noise.
+    noise or, without a stated noise, if the readings span only a few steps. If all readings are
+    multiples of ten steps, it is wrong if such a rounding is larger than the stated noise.
     """
     for name, gauge in session.gauges_with_readings.items():
         step, sigma = gauge.resolution, gauge.sigma
         if not step:
             continue
-        of = _keys_of(session, name)
+        keys = _keys_of(session, name)
         if sigma and sigma > WRONG_UNIT_RATIO * step:
-            yield words.sigma_too_large(sigma, of, step=step)
+            yield words.sigma_too_large(sigma, keys, step=step)
         if gauge.range and np.ptp(gauge.range) < MIN_RANGE_STEPS * step:
-            yield words.coarser_than_range(step, gauge.range, of)
+            yield words.coarser_than_range(step, gauge.range, keys)
             continue
         rows = _rows_of(session, name)
         coarser = _coarser_step(session.values[rows], step)
         if noise_floor(sigma, coarser) > MIN_EXCESS * noise_floor(sigma, step):
-            yield words.finer_than_readings(len(rows), step, coarser, of)
+            yield words.finer_than_readings(
+                len(rows), step, coarser, keys, noise_stated=bool(sigma)
+            )
         finer = _finer_rows(session, rows, gauge)
         if finer and (
             step > WRONG_UNIT_RATIO * sigma
             if sigma
             else np.ptp(session.values[rows]) < MIN_SPANNED_STEPS * step
         ):
-            first = _first(session, finer)
-            yield words.coarser_than_readings(len(finer), len(rows), step, *first, of=of)
+            evidence = _evidence(session, finer)
+            yield words.coarser_than_readings(len(finer), len(rows), step, *evidence, keys=keys)
 
 
 def _coarser_step(values: Array, step: float) -> float:
-    """Largest step, ten times the stated one or more, of which all readings are multiples, [m].
+    """Largest power of ten times the stated step of which all readings are multiples, [m].
 
-    The stated step if a reading is no multiple, or if all are multiples by chance.
+    The stated step if a reading is no multiple of ten steps, or if all are multiples by chance.
     """
     nonzero = np.abs(values[values != 0.0]) / step
     while 10.0 ** -len(nonzero) < MISTAKE_PROBABILITY:
         coarser = nonzero / 10.0
-        if (np.abs(coarser - np.round(coarser)) > STEP_TOLERANCE).any():
+        whole = np.round(coarser)
+        if (whole == 0.0).any() or (np.abs(coarser - whole) > STEP_TOLERANCE).any():
             break
         nonzero, step = coarser, 10.0 * step
     return step
@@ -142,29 +149,28 @@ def find_finer(session: Session) -> Iterator[Finding]:
         rows = _rows_of(session, name)
         if finer := _finer_rows(session, rows, gauge):
             step = gauge.resolution or 0.0
-            inches = _fit_inches(session.values[rows], step)
-            first = _first(session, finer)
+            inches = _are_inches(session.values[rows], step)
+            evidence = _evidence(session, finer)
             yield words.finer_than_gauge(
                 len(finer),
                 len(rows),
                 step,
-                *first,
+                *evidence,
                 inches=inches,
-                of=_keys_of(session, name),
+                keys=_keys_of(session, name),
             )
 
 
-def _fit_inches(values: Array, step: float) -> bool:
-    """True if readings are multiples of a step if they are in inches, and not by chance.
+def _are_inches(values: Array, step: float) -> bool:
+    """True if the readings, taken as inches, are multiples of the step, and this is not chance.
 
     Args:
-        values: Readings between the steps if they are in mm, shape (n,), [m].
+        values: Readings, taken as mm, shape (n,), [m].
         step: Step of their gauge, [m].
     """
     values = values[values != 0.0]
-    to_inches = INCH / MM
-    half_width = 0.5 * to_inches * decimal_steps(values).min() / step + STEP_TOLERANCE
-    steps = to_inches * values / step
+    half_width = 0.5 * MM_PER_INCH * decimal_steps(values).min() / step + STEP_TOLERANCE
+    steps = MM_PER_INCH * values / step
     by_chance = (2.0 * half_width) ** len(values)
     fit = np.abs(steps - np.round(steps)) <= half_width
     return bool(fit.all()) and by_chance < MISTAKE_PROBABILITY
@@ -192,8 +198,8 @@ def _finer_rows(session: Session, rows: list[int], gauge: Gauge) -> list[int]:
     return [rows[i] for i in finer] if finer and len(finer) * 2 >= len(rows) else []
 
 
-def _first(session: Session, rows: Sequence[int]) -> tuple[str, float, list[Place]]:
-    """File and line of the first row, its reading in m, and the places of all rows."""
+def _evidence(session: Session, rows: Sequence[int]) -> tuple[str, float, list[Place]]:
+    """File and line of the first row, its reading in m, and the first MAX_PLACES places."""
     first = session.readings[rows[0]]
     return session.where(first), first.value, [place_of(session, i) for i in rows[:MAX_PLACES]]
 
@@ -226,8 +232,8 @@ def _by_model(
         fitted = fit_problem(problem, options=options, rounds=1)
     except (OrthocalError, np.linalg.LinAlgError):
         return  # other findings report readings that no machine can cause
-    yield _too_small(session, fitted)
-    yield _coarse(session, fitted)
+    yield _residuals_too_small(session, fitted)
+    yield _sigma_too_large(session, fitted)
 
 
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:
@@ -241,21 +247,22 @@ def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None
     observations = problem.observations
     values = problem.values * problem.noise_ratio
     expected = problem.predict(problem.active_theta) * problem.noise_ratio
-    readings, deviations = (
-        observations.rows(project_out_zeros(v, observations)) for v in (values, values - expected)
+    readings, predictions, deviations = (
+        observations.rows(project_out_zeros(v, observations))
+        for v in (values, expected, values - expected)
     )
     measured, deviation = _rms(readings), _rms(deviations)
     if deviation < MIN_WRONG_MACHINE or deviation < WRONG_MACHINE_RATIO * measured:
         return None
     worst = int(np.argmax(np.abs(deviations)))
     others = [r for i, r in enumerate(session.readings) if i != worst]
-    if np.abs(deviations[worst]) > HALF_OF_SQUARES * np.linalg.norm(deviations) and others:
+    if np.abs(deviations[worst]) > DOMINANT_SHARE * np.linalg.norm(deviations) and others:
         rest = session.select(others)
         return _dimensions(rest, build_problem(rest, model="offsets"))
-    return words.wrong_dimensions(describe_legs(session.robot), deviation, measured)
+    return words.wrong_dimensions(describe_legs(session.robot), _rms(predictions), measured)
 
 
-def _too_small(session: Session, fit: Fit) -> Finding | None:
+def _residuals_too_small(session: Session, fit: Fit) -> Finding | None:
     """Finding about residuals that are smaller than the rounding to steps of the only gauge."""
     step, noise = session.gauge.resolution, fit.noise
     if not step:
@@ -270,7 +277,7 @@ def _too_small(session: Session, fit: Fit) -> Finding | None:
     return words.residuals_too_small(noise.residual_sigma, rounding_std, step)
 
 
-def _coarse(session: Session, fit: Fit) -> Finding | None:
+def _sigma_too_large(session: Session, fit: Fit) -> Finding | None:
     """Finding about a stated noise of the only gauge far above the scatter of repeated readings.
 
     Without repetitions it is compared with the residuals.
@@ -281,8 +288,8 @@ def _coarse(session: Session, fit: Fit) -> Finding | None:
     repeated = noise.cycles_dof >= MIN_DOF
     scatter = noise.cycles_sigma if repeated else noise.residual_sigma
     dof = noise.cycles_dof if repeated else noise.residual_dof
-    if dof < MIN_DOF or not MIN_DIAL_SCATTER < WRONG_UNIT_RATIO * scatter < stated:
-        return None  # readings without any scatter were computed
+    if dof < MIN_DOF or scatter < MIN_DIAL_SCATTER or stated <= WRONG_UNIT_RATIO * scatter:
+        return None
     (name,) = session.gauges_with_readings
     return words.sigma_too_large(stated, _keys_of(session, name), scatter=scatter)
 
@@ -294,29 +301,38 @@ def _check_distances(session: Session) -> Finding | None:
     coordinates, first = np.unique(drives, axis=0, return_index=True)
     if len(coordinates) < 3:
         return None
-    distances = _nearest_distances(coordinates)
-    largest = float(np.linalg.norm(np.ptp(coordinates, axis=0)))
+    units = [d.unit for d in session.robot.drives]
+    columns = {u: [unit == u for unit in units] for u in units}
+    spans = {u: _largest_distance(coordinates[:, c]) for u, c in columns.items()}
+    scale = np.array([spans[u] or 1.0 for u in units])  # drives in mm and in deg are comparable
+    neighbours, distances = _nearest(coordinates / scale)
     zero = session.robot.drive_zero - session.active_offsets
-    distances_from_zero = np.linalg.norm(coordinates - zero, axis=1)
-    too_near = np.flatnonzero(
-        np.maximum(distances, distances_from_zero) < SAME_POSTURE_RATIO * largest
-    )
+    distances_from_zero = np.linalg.norm((coordinates - zero) / scale, axis=1)
+    too_near = np.flatnonzero(np.maximum(distances, distances_from_zero) < SAME_POSTURE_RATIO)
     if not too_near.size:
         return None
     last = too_near[first[too_near].argmax()]
     name = list(session.postures)[int(first[last])]
-    return words.postures_too_near(name, float(distances[last]), largest)
+    gap = coordinates[last] - coordinates[neighbours[last]]
+    gaps = {u: (float(np.linalg.norm(gap[c])), spans[u]) for u, c in columns.items()}
+    return words.postures_too_near(name, gaps)
 
 
-def _nearest_distances(points: Array) -> Array:
-    """Distance of each point from its nearest neighbour, shape (n,) of points (n, n_drives)."""
+def _largest_distance(points: Array) -> float:
+    """Diagonal of the box around points, shape (n, n_drives)."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _nearest(points: Array) -> tuple[Indices, Array]:
+    """Nearest neighbour of each point and its distance, shapes (n,) of points (n, n_drives)."""
     if len(points) > MANY_POSTURES:
         from scipy.spatial import KDTree
 
-        return np.asarray(KDTree(points).query(points, k=2)[0])[:, 1]
+        distances, neighbours = KDTree(points).query(points, k=2)
+        return np.asarray(neighbours)[:, 1], np.asarray(distances)[:, 1]
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(distances, np.inf)
-    return np.asarray(distances.min(axis=1))
+    return distances.argmin(axis=1), distances.min(axis=1)
 
 
 def _legs(robot: Robot) -> Finding | None:
@@ -327,7 +343,7 @@ def _legs(robot: Robot) -> Finding | None:
         return None
     errors = [e.name for e in robot.parameters.elementary.values() if e.kind == "translation"]
     tolerance = max((robot.parameters[n].prior_std for n in errors), default=0.0)
-    if max(lengths.values()) - min(lengths.values()) < SAME_LENGTH * tolerance:
+    if max(lengths.values()) - min(lengths.values()) <= SAME_LENGTH * tolerance:
         return None
     return words.legs_differ(describe_legs(robot), lengths)
 

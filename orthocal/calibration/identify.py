@@ -76,7 +76,7 @@ def identify(
         gathered = [choice.applied_to(one) for one in gathered]
     session = join_sessions(gathered)
     require_complete(session)
-    require_names(profile, argument="profile")
+    profile = require_names(profile, argument="profile")
     chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))

@@ -26,24 +26,24 @@ from orthocal.units import read_limit
 class Choice:
     """Free errors of the machine, their priors, known values and bounds.
 
-    Keys of numbers end with the unit, as on the command line: {"x_leg.length_mm": 0.12}. The
-    suffixes are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
+    Keys of numbers end with the unit, as on the command line: {"x_leg.length_mm": 0.12}.
+    `orthocal.units.UNIT_SUFFIXES` has all suffixes, such as _mm, _mrad and _ppm.
 
     Args:
         model: A model of the robot's YAML: `offsets`, `lengths`, `full` or another. By default
             that of the session, otherwise the complete model.
-        free: Names or globs added to the model, or all free errors if no model is stated. '!'
-            excludes.
+        free: Names or globs to add to the model. Without a model they are the only free errors.
+            '!' excludes.
         prior: Use priors; by default True, unless only offsets are free.
         known: Names with unit, mapped to a known value, which is fixed, or to a value and its
             tolerance (±2 prior standard deviations), which become the prior.
         tolerances: Names or globs with unit, mapped to tolerances (±2 prior standard deviations)
-            that replace those of the session or robot for all purposes.
+            that replace those of the session or robot, also where readings are judged.
         bounds: Names or globs with unit, mapped to lowest and highest value, ±inf for open.
         base: Identify base parameters without priors. One parameter of each indistinguishable
             combination remains free and represents the combination.
-        effects: Effects in addition to geometry, such as `backlash`, which any model identifies. By
-            default those of the session, otherwise those of the robot's YAML.
+        effects: Effects in addition to geometry, such as `backlash`. Every model identifies their
+            errors. By default those of the session, otherwise those of the robot's YAML.
 
     Raises:
         TypeError: If an argument has a wrong type.
@@ -60,9 +60,10 @@ class Choice:
 
     def __post_init__(self) -> None:
         require_kind(self.model, (str, type(None)), expected="the name of a model")
-        require_names(self.free, argument="free")
+        object.__setattr__(self, "free", require_names(self.free, argument="free"))
         if self.effects is not None:
-            require_names(self.effects, argument="effects")
+            effects = require_names(self.effects, argument="effects")
+            object.__setattr__(self, "effects", effects)
         require_numbers(self.known, argument="known", counts=(1, 2))
         require_numbers(self.tolerances, argument="tolerances")
         require_numbers(self.bounds, argument="bounds", counts=(2,))
@@ -71,7 +72,7 @@ class Choice:
             raise TypeError(f"prior: found a {kind}; expected True, False or None")
         if not isinstance(self.base, bool):
             raise TypeError(f"base: found a {type(self.base).__name__}; expected True or False")
-        # JSON and YAML have lists instead of tuples
+        # a value and its tolerance are a list in JSON and YAML
         known = {k: tuple(v) if isinstance(v, list) else v for k, v in self.known.items()}
         object.__setattr__(self, "known", known)
 
@@ -110,7 +111,8 @@ class Choice:
             listed = ", ".join(with_tolerance)
             raise ParameterError(
                 "base parameters are identified without any prior"
-                + (f"; state {listed} as known without ±" if listed else "")
+                + (f"; state {listed} as known without ±" if listed else ""),
+                where="base",
             )
         selection = select_parameters(
             parameters,
@@ -165,7 +167,10 @@ def _require_used(
     for key in tolerances:
         glob, _ = parameters.read_glob(key)
         if used.isdisjoint(parameters.select([glob])):
-            raise ParameterError(f"'{glob}' matches no free parameter", where="tolerances")
+            raise ParameterError(
+                f"'{glob}' matches only sums that are not free; state tolerances of their terms",
+                where="tolerances",
+            )
 
 
 def _known_in_si(

@@ -222,6 +222,12 @@ def _find_bounds(
             for name in _match_free(parameters, glob, names):
                 i = names.index(name)
                 lower[i], upper[i] = max(low, lower[i]), high
+                if not lower[i] < high:
+                    parameter = parameters[name]
+                    bound = f"{high * parameter.edge_factor:g} {parameter.edge_unit}"
+                    raise ParameterError(
+                        f"'{name}' is never negative, but its upper bound is {bound}"
+                    )
     return lower, upper
 
 

@@ -75,7 +75,7 @@ def draw_errors(
         ParameterError: If a pattern matches nothing.
     """
     require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
-    require_names(patterns, argument="patterns")
+    patterns = require_names(patterns, argument="patterns")
     require_seed(seed)
     # a spawned stream is independent of those of noise (seed), of nuisance parameters (seed, 1)
     # and of studies (seed, number)

@@ -40,7 +40,10 @@ PostureForm = Literal["tcp", "joints"]
 
 @dataclass(frozen=True, slots=True)
 class Purpose:
-    """Default model and free errors of `calibrate`."""
+    """Model and free errors that a session states for `calibrate`.
+
+    Of joined sessions, those that state nothing follow the others.
+    """
 
     __pydantic_config__ = CLOSED
 

@@ -274,15 +274,14 @@ class _Prepared:
         return {**errors, **dict.fromkeys(METHODS[3:], general)}
 
 
-def _require_arguments(source: object, free: object, sizes: Sequence[float]) -> None:
-    """Refuse arguments of `build_linearisation_study` of another kind.
+def _require_arguments(source: object, sizes: Sequence[float]) -> None:
+    """Refuse a source or sizes of `build_linearisation_study` of another kind.
 
     Raises:
-        TypeError: If the source or the names are of another kind.
+        TypeError: If the source is of another kind.
         ParameterError: If a size is not positive.
     """
     require_kind(source, (Robot, Session), expected="a Robot or a Session")
-    require_names(free, argument="free")
     for size in sizes:
         if not 0.0 < size < math.inf:
             raise ParameterError(f"found {size}; expected a positive size", where="sizes")
@@ -319,10 +318,10 @@ def build_linearisation_study(
         ParameterError: If nothing can be identified, or a number is invalid.
         RobotError: If the robot cannot be measured by the paper's plan.
     """
-    _require_arguments(source, free, [largest, *(() if sizes is None else sizes)])
+    _require_arguments(source, [largest, *(() if sizes is None else sizes)])
     require_counts(count=count, directions=directions)
     robot = source if isinstance(source, Robot) else source.robot
-    names = robot.parameters.select(free)
+    names = robot.parameters.select(require_names(free, argument="free"))
     if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:
         raise ParameterError("expected lengths and angles; a scale has no mm", where="--free")
     paper_displacements = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import plans
@@ -16,7 +17,13 @@ from models import TRUTH
 
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.plausibility import describe_legs, find_implausible, find_impossible_gauges
+from orthocal.assessment.plausibility import (
+    _check_distances,
+    _legs,
+    describe_legs,
+    find_implausible,
+    find_impossible_gauges,
+)
 from orthocal.assessment.words.effects import approach_incomplete
 from orthocal.assessment.words.plausibility import outstanding_error
 from orthocal.calibration.file import calibration_json
@@ -56,6 +63,18 @@ def test_readings_in_inches_are_found(session):
     assert "residuals too small" in kinds(inches)
     found = [f for f in judge_session(inches).findings if f.severity != "note"]
     assert [f.kind for f in found] == ["wrong unit"]
+
+
+def test_small_readings_in_metres_are_found():
+    """None of them is a hundredth of a step of the gauge."""
+    errors = {name: 0.1 * error for name, error in TRUTH.items()}
+    session = simulate_session(plan_of("workshop"), errors, seed=1).session
+    metres = session.with_values(np.round(session.values * 1e-3, 9))
+    assert not list(find_impossible_gauges(metres))
+    found = [f for f in judge_session(metres).findings if f.severity != "note"]
+    assert [(f.kind, f.text) for f in found] == [
+        ("wrong unit", "It looks as if all readings were written in m.")
+    ]
 
 
 def test_some_means_of_cycles_may_be_finer_than_the_dial(session):
@@ -102,6 +121,14 @@ def test_postures_of_a_machine_of_other_dimensions_are_found(tmp_path, plan, ses
     found = judge_session(other.with_values(values))
     assert found.findings[0].kind == "wrong dimensions"
     assert found.verdict == "reject"
+    nominal = simulate_session(other, {}, exact=True).session.values
+    setups = np.array([r.setup for r in other.readings])
+    for motion, name in ((nominal, "nominal_rms_mm"), (np.array(values), "measured_rms_mm")):
+        centred = np.array(motion)
+        for setup in other.setups:
+            centred[setups == setup] -= centred[setups == setup].mean()
+        expected = 1e3 * np.sqrt(np.mean(centred**2))
+        assert found.findings[0].numbers[name] == pytest.approx(expected)
 
 
 def test_a_line_with_the_name_of_another_setup_is_not_another_machine():
@@ -132,6 +159,14 @@ def test_legs_of_different_lengths_are_found(tmp_path):
     assert found.numbers == pytest.approx({"x_mm": 308.3, "y_mm": 310.25, "z_mm": 310.25})
 
 
+def test_equal_legs_without_errors_of_their_frames_do_not_differ(cycles):
+    robot = cycles.robot
+    names = [n for n, e in robot.parameters.elementary.items() if e.kind != "translation"]
+    parameters = SimpleNamespace(elementary={n: robot.parameters.elementary[n] for n in names})
+    rigid = SimpleNamespace(legs=robot.legs, drives=robot.drives, parameters=parameters)
+    assert _legs(rigid) is None
+
+
 @pytest.mark.parametrize(
     ("gauge", "number"),
     [
@@ -160,6 +195,10 @@ def test_a_resolution_of_a_tenth_of_the_readings_is_the_only_finding(cycles):
     (found,) = [f for f in judge_session(wrong).findings if f.severity != "note"]
     assert found.kind == "resolution too fine"
     assert found.numbers == pytest.approx({"resolution_mm": 0.001, "coarser_mm": 0.01})
+    assert "more scatter than its stated noise" in found.text
+    unstated = wrong.with_gauge(replace(wrong.gauge, sigma=None))
+    (found,) = find_impossible_gauges(unstated)
+    assert "stated noise" not in found.text
     rows = np.arange(5)  # five such readings may be by chance
     assert not list(find_impossible_gauges(wrong.select([wrong.readings[i] for i in rows])))
 
@@ -210,9 +249,11 @@ def test_a_sigma_in_micrometres_is_found(cycles):
     (found,) = [d for d in find_implausible(coarse) if d.kind == "sigma too large"]
     assert found.numbers["gauge_sigma_mm"] == pytest.approx(10.0)
     assert "sigma too large" not in kinds(cycles)
-    same = cycles.with_values(np.zeros(len(cycles.readings)))
-    same = same.with_gauge(replace(same.gauge, sigma=10e-6, resolution=None))
-    assert "sigma too large" not in kinds(same)
+    for scatter in (0.0, 5e-8):
+        noise = scatter * np.random.default_rng(0).normal(size=len(cycles.readings))
+        same = cycles.with_values(noise)
+        same = same.with_gauge(replace(same.gauge, sigma=10e-6, resolution=None))
+        assert "sigma too large" not in kinds(same)
 
 
 def test_a_sigma_that_is_too_large_is_found_in_each_of_joined_sessions(cycles):
@@ -236,6 +277,38 @@ def test_a_posture_in_metres_is_found(cycles):
     (found,) = [f for f in find_implausible(near(cycles, name, "zero")) if "near" in f.kind]
     assert found.numbers["gap_mm"] == pytest.approx(0.087, abs=0.001)
     assert found.places[0].posture in (name, "zero")
+
+
+def test_near_postures_are_described_in_the_units_of_their_drives(fivebar):
+    """A slide in m and a motor in rad are compared in their own travels."""
+    displacements = {"a": (0, 0), "b": (0.5, 0), "c": (0, 0.5), "d": (-0.4, 0.3), "e": (3e-4, 0)}
+
+    def find(units):
+        """Finding about postures of two drives with these units."""
+        drives = [replace(d, unit=u) for d, u in zip(fivebar.drives, units, strict=True)]
+        postures = {
+            n: SimpleNamespace(drives=fivebar.drive_zero + np.array(d))
+            for n, d in displacements.items()
+        }
+        session = SimpleNamespace(
+            robot=SimpleNamespace(drives=drives, drive_zero=fivebar.drive_zero),
+            active_offsets=np.zeros(2),
+            readings=(),
+            postures=postures,
+        )
+        session.select = lambda readings: session
+        return _check_distances(session)
+
+    gap, largest = np.degrees(3e-4), np.degrees(np.hypot(0.9, 0.5))
+    found = find(["rad", "rad"])
+    assert found.places[0].posture == "e"
+    assert found.numbers == pytest.approx({"gap_deg": gap, "largest_deg": largest})
+    assert "0.017 deg from another one; others are up to 59 deg apart" in found.text
+    found = find(["m", "rad"])
+    expected = {"gap_mm": 0.3, "largest_mm": 900.0, "gap_deg": 0.0, "largest_deg": np.degrees(0.5)}
+    assert found.numbers == pytest.approx(expected)
+    displacements["e"] = (3e-4, 0.02)  # near along the slide only
+    assert find(["m", "rad"]) is None
 
 
 def test_neighbouring_postures_far_from_the_mechanical_zero_are_plausible(cycles):

@@ -139,6 +139,7 @@ def test_parameters_without_sensitivity_are_explained(exact_plan):
     result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]), **UNJUDGED)
     (found,) = result.assessment.of_kind("no sensitivity")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
+    assert "effects of all free parameters on the readings are below the noise" in found.text
     assert set(result.identifiability.below_noise) == {p.name for p in result.free}
 
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibrated import session_of
 
+from orthocal import draw_errors
+from orthocal.calibration.identify import identify
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice
 from orthocal.estimation.selection import (
@@ -18,6 +21,11 @@ from orthocal.estimation.selection import (
 @pytest.fixture(scope="module")
 def parameters(orthoglide):
     return orthoglide.parameters
+
+
+@pytest.fixture(scope="module")
+def session():
+    return session_of("raw-cycles")
 
 
 def test_the_complete_model_is_the_default(parameters):
@@ -72,6 +80,32 @@ def test_bounds_are_open_where_none_is_given(parameters):
     assert chosen.lower[0] == -1e-3
     assert np.isinf(chosen.upper).all()
     assert np.isinf(chosen.lower[1:]).all()
+
+
+def test_bounds_below_zero_of_a_parameter_that_is_never_negative_are_refused(session):
+    parameters = session.with_effects(["backlash"]).robot.parameters
+    free = ["*.offset", "x_slide.backlash"]
+
+    def select(low, high):
+        return select_parameters(parameters, free=free, bounds={"x_slide.backlash": (low, high)})
+
+    chosen = select(-1e-3, 1e-3)
+    assert (chosen.lower[-1], chosen.upper[-1]) == (0.0, 1e-3)
+    for high in (-1e-3, 0.0):
+        with pytest.raises(
+            ParameterError, match=r"'x_slide\.backlash' is never negative"
+        ) as raised:
+            select(-2e-3, high)
+        assert raised.value.where == "bounds"
+
+
+def test_names_from_an_iterator_are_kept(session):
+    names = ["x_slide.offset", "y_slide.offset"]
+    choice = Choice(free=iter(names), effects=iter(["backlash"]))
+    assert choice == Choice(free=tuple(names), effects=("backlash",))
+    assert choice.select(session.robot.parameters).names == tuple(names)
+    assert identify(session, choice, profile=iter(names[:1]))[0].free[0].interval is not None
+    assert list(draw_errors(session.robot, iter(names), seed=0)) == names
 
 
 @pytest.mark.parametrize(

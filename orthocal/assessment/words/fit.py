@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, times
+from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, signed, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
@@ -151,11 +151,12 @@ def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
     )
 
 
-def nothing_depends(names: Sequence[str]) -> Finding:
-    """Finding that no reading depends on any free parameter."""
+def no_sensitivity(names: Sequence[str]) -> Finding:
+    """Finding that the effects of all free parameters on the readings are below the noise."""
     return note(
         "no sensitivity",
-        "No reading depends on any free parameter, so all keep their start values.",
+        "The effects of all free parameters on the readings are below the noise, so all keep "
+        "their start values.",
         "Read setups and postures that depend on the parameters.",
         parameter_places(*names),
     )
@@ -190,12 +191,17 @@ def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
 def effect_above_tolerance(parameter: ParameterEstimate) -> Finding:
     """Finding about an error of an effect, such as a backlash, far above its tolerance."""
     unit, factor = parameter.edge_unit, parameter.edge_factor
-    tolerance = show_limit(parameter.prior_std)
+    tolerance, error = show_limit(parameter.prior_std), parameter.value - parameter.mean
+    estimate = f"estimated to be {plain(parameter.value * factor)} {unit}"
+    if parameter.mean:
+        estimate += f", {signed(error * factor)} {unit} from its stated value"
     return note(
         "above tolerances",
-        f"{parameter.name} is estimated to be {plain(parameter.value * factor)} {unit}, "
-        f"{times(abs(parameter.value) / tolerance)} its tolerance. With so small a tolerance the "
-        "estimate is too small.",
+        f"{parameter.name} is {estimate}, {times(abs(error) / tolerance)} its tolerance. So small "
+        "a tolerance keeps the estimate too close to the stated value."
+        if parameter.mean
+        else f"{parameter.name} is {estimate}, {times(abs(error) / tolerance)} its tolerance. With "
+        "so small a tolerance the estimate is too small.",
         "Check this part of the machine. If it is so far off, state a larger tolerance and "
         "calibrate again.",
         parameter_places(parameter.name),
@@ -251,16 +257,16 @@ def line_assumed(difference: float, setup: str, touches: str, sigma: float) -> F
     """Finding about a gauge that is modelled by the centre line of the leg, where there is no rod.
 
     Args:
-        difference: Difference of the readings on a rod, [m].
+        difference: Difference of the readings on the rod, [m].
         setup: Setup of the gauge.
-        touches: Value of `touches` for a rod.
+        touches: Name of the rod.
         sigma: Standard deviation of a reading, [m].
     """
     return note(
         "line assumed",
         "orthocal assumes that the gauge reads the centre line between the two rods of a leg. On "
-        f"a rod the readings differ by about {mm(difference)} mm (setup {setup}).",
-        f"If it touched a rod, state `touches: {touches}` and the gauge's `tip`.",
+        f"rod {touches} the readings differ by about {mm(difference)} mm (setup {setup}).",
+        f"If it touched a rod, state that rod (such as `touches: {touches}`) and its `tip`.",
         (Place(setup=setup),),
         off_line_mm=difference / MM,
         sigma_mm=sigma / MM,

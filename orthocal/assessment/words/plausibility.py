@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from orthocal.assessment.wording import (
@@ -17,7 +17,7 @@ from orthocal.assessment.wording import (
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.robot.parameters import Parameter
 from orthocal.text import spans
-from orthocal.units import MM, UM, show_limit
+from orthocal.units import DRIVE_UNITS, MM, UM, Unit, show_limit
 
 
 def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
@@ -113,7 +113,7 @@ def above_tolerances(scale: float) -> Finding:
 
 @dataclass(frozen=True, slots=True)
 class GaugeKeys:
-    """Gauge of a finding."""
+    """Gauge of a finding and the places of its keys."""
 
     name: str
     """Name of the gauge; empty if the readings have no other."""
@@ -137,7 +137,7 @@ def finer_than_gauge(
     places: Sequence[Place],
     *,
     inches: bool,
-    of: GaugeKeys,
+    keys: GaugeKeys,
 ) -> Finding:
     """Finding about readings between the steps of the gauge.
 
@@ -147,20 +147,20 @@ def finer_than_gauge(
         step: Step of the gauge, [m].
         where: File and line of the first of them.
         value: Its value, [m].
-        places: Places of all of them.
+        places: Places of them.
         inches: Whether all readings of the gauge are multiples of the step if they are in inches.
-        of: The gauge.
+        keys: The gauge.
     """
     first = f"The first is {value / MM:.6g} mm in {where}."
     text, action = (
-        f"The gauge{_named(of.name)} shows steps of {step / MM:g} mm ({of.resolution}), but "
+        f"The gauge{_named(keys.name)} shows steps of {step / MM:g} mm ({keys.resolution}), but "
         f"{count} of its {total} readings have more digits, or are in inches. {first}",
         "Make sure that the readings are in mm, not in inches, and that the resolution is right"
-        f"{', and that each setup names its gauge' if of.name else ''}.",
+        f"{', and that each setup names its gauge' if keys.name else ''}.",
     )
     if inches:
         text, action = (
-            f"All {total} readings of the gauge{_named(of.name)} appear to be in inches: "
+            f"All {total} readings of the gauge{_named(keys.name)} appear to be in inches: "
             "multiplied by 25.4, they are multiples of the resolution, "
             f"{step / MM:g} mm. {first}",
             "If so, multiply these readings by 25.4, or use `orthocal import --unit inch`.",
@@ -175,20 +175,20 @@ def finer_than_gauge(
     )
 
 
-def _stated_resolution(step: float, of: GaugeKeys) -> str:
+def _stated_resolution(step: float, keys: GaugeKeys) -> str:
     """Beginning of a sentence about the stated resolution of a gauge, [m]."""
     return (
-        f"The stated resolution of the gauge{_named(of.name)} is {step / MM:g} mm "
-        f"({of.resolution}), but"
+        f"The stated resolution of the gauge{_named(keys.name)} is {step / MM:g} mm "
+        f"({keys.resolution}), but"
     )
 
 
-def coarser_than_range(step: float, limits: tuple[float, float], of: GaugeKeys) -> Finding:
+def coarser_than_range(step: float, limits: tuple[float, float], keys: GaugeKeys) -> Finding:
     """Finding that the stated range of the gauge has only a few of its steps."""
     low, high = (limit / MM for limit in limits)
     return review(
         "resolution too coarse",
-        f"{_stated_resolution(step, of)} its range is {low:g} … {high:g} mm.",
+        f"{_stated_resolution(step, keys)} its range is {low:g} … {high:g} mm.",
         "Make sure that its resolution_mm and its range_mm are in mm.",
         resolution_mm=step / MM,
         range_mm=high - low,
@@ -203,12 +203,12 @@ def coarser_than_readings(
     value: float,
     places: Sequence[Place],
     *,
-    of: GaugeKeys,
+    keys: GaugeKeys,
 ) -> Finding:
     """Finding that readings contradict the stated resolution of the gauge."""
     return review(
         "resolution too coarse",
-        f"{_stated_resolution(step, of)} {count} of its {total} readings lie between such steps. "
+        f"{_stated_resolution(step, keys)} {count} of its {total} readings lie between such steps. "
         f"The first is {value / MM:.6g} mm in {where}.",
         "Make sure that its resolution_mm is right, and that the readings are in mm.",
         places,
@@ -217,12 +217,23 @@ def coarser_than_readings(
     )
 
 
-def finer_than_readings(total: int, step: float, coarser: float, of: GaugeKeys) -> Finding:
-    """Finding that all readings are multiples of a coarser step than the stated one, [m]."""
+def finer_than_readings(
+    total: int, step: float, coarser: float, keys: GaugeKeys, *, noise_stated: bool
+) -> Finding:
+    """Finding that all readings are multiples of a coarser step than the stated one, [m].
+
+    Args:
+        total: Number of readings of the gauge.
+        step: Its stated resolution, [m].
+        coarser: Step of which the readings are multiples, [m].
+        keys: The gauge.
+        noise_stated: Whether the noise of the gauge is stated.
+    """
+    noise = " Such rounding causes more scatter than its stated noise." if noise_stated else ""
     return review(
         "resolution too fine",
-        f"{_stated_resolution(step, of)} all its {total} readings are multiples of "
-        f"{coarser / MM:g} mm. Such readings scatter more than the stated noise.",
+        f"{_stated_resolution(step, keys)} all its {total} readings are multiples of "
+        f"{coarser / MM:g} mm.{noise}",
         f"State `resolution_mm: {coarser / MM:g}`, and the noise of this gauge in sigma_mm; or "
         "write all digits that the gauge shows.",
         resolution_mm=step / MM,
@@ -245,13 +256,13 @@ def residuals_too_small(residual: float, rounding: float, step: float) -> Findin
 
 
 def sigma_too_large(
-    stated: float, of: GaugeKeys, *, scatter: float | None = None, step: float = 0.0
+    stated: float, keys: GaugeKeys, *, scatter: float | None = None, step: float = 0.0
 ) -> Finding:
     """Finding about a stated noise far above the scatter or the resolution of the gauge.
 
     Args:
         stated: Stated noise, [m].
-        of: The gauge.
+        keys: The gauge.
         scatter: Scatter of the readings, [m]; None to compare with the resolution.
         step: Resolution of the gauge, [m].
     """
@@ -263,7 +274,7 @@ def sigma_too_large(
     reference = step if scatter is None else scatter
     return review(
         "sigma too large",
-        f"The stated noise of the gauge{_named(of.name)} is {stated / MM:g} mm ({of.sigma}). "
+        f"The stated noise of the gauge{_named(keys.name)} is {stated / MM:g} mm ({keys.sigma}). "
         f"{shown}",
         "Make sure that its sigma_mm is in mm.",
         gauge_sigma_mm=stated / MM,
@@ -272,16 +283,27 @@ def sigma_too_large(
     )
 
 
-def postures_too_near(posture: str, gap: float, largest: float) -> Finding:
-    """Finding about a posture that is much closer to another one than the others, [m]."""
+def postures_too_near(posture: str, distances: Mapping[Unit, tuple[float, float]]) -> Finding:
+    """Finding about a posture that is much closer to another one than the others.
+
+    Args:
+        posture: Name of the posture.
+        distances: Unit of drives, mapped to the distance of the posture from the other one and to
+            the largest distance of postures, [unit].
+    """
+    shown = {
+        DRIVE_UNITS[unit][0]: [value / DRIVE_UNITS[unit][1] for value in values]
+        for unit, values in distances.items()
+    }
+    near = joined([f"{gap:.2g} {unit}" for unit, (gap, _) in shown.items()])
+    apart = joined([f"{largest:.0f} {unit}" for unit, (_, largest) in shown.items()])
     return review(
         "postures too near",
-        f"Posture '{posture}' is {gap / MM:.2g} mm from another one. Others are up to "
-        f"{largest / MM:.0f} mm apart.",
-        "Make sure that its coordinates are in mm, not in metres.",
+        f"Posture '{posture}' is {near} from another one; others are up to {apart} apart.",
+        "Make sure that its coordinates are in the stated unit, such as mm, not in metres.",
         (Place(posture=posture),),
-        gap_mm=gap / MM,
-        largest_mm=largest / MM,
+        **{f"gap_{unit}": gap for unit, (gap, _) in shown.items()},
+        **{f"largest_{unit}": largest for unit, (_, largest) in shown.items()},
     )
 
 
