@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +25,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.printing import deliver, print_rows, put_note
 from orthocal.errors import ClosureError, SessionError
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _print_points(
 
     rows = accuracy_rows(result, targets, names=names, conditions=conditions)
     put_assumed(result, conditions)
-    note = ABSOLUTE_NOTE.format(shlex.quote(str(path)))
+    note = ABSOLUTE_NOTE.format(quote_path(path))
     try:
         print_rows(POINT_COLUMNS, format_points, rows)
     except Exit:  # some rows are empty

@@ -12,7 +12,7 @@ from orthocal.cli.options import Json, command
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
-from orthocal.text import printable, shorten
+from orthocal.text import printable, quote_path, shorten
 from orthocal.units import MM
 
 OF_TABLES = (
@@ -133,8 +133,6 @@ def _require_session(table: Path, session: Path) -> None:
     Raises:
         SessionError: Naming what is missing, or the order of exchanged arguments.
     """
-    from orthocal.output.text.answer import quote_path
-
     if exists(_session_file(session)):
         return
     if not exists(table):

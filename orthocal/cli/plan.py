@@ -41,6 +41,7 @@ from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ParameterError
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
@@ -113,7 +114,7 @@ def plan(
     Args:
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
     """
-    from orthocal.output.text.answer import calibrate_command, quote_path
+    from orthocal.output.text.answer import calibrate_command
     from orthocal.output.text.plan import describe_assumed_tip, plan_json
     from orthocal.output.text.summary import print_summary
     from orthocal.runtime.worker_pool import available_cores, worker_budget

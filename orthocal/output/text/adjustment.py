@@ -22,8 +22,9 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError
 from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
-from orthocal.output.text.answer import quote_path, render_next
+from orthocal.output.text.answer import render_next
 from orthocal.output.text.layout import bullets, plain, print_rich, signed, table_of
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 SCHEMA = "orthocal/adjustment/1"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -45,7 +44,7 @@ from orthocal.output.text.layout import (
     table_of,
 )
 from orthocal.session.session import split_label
-from orthocal.text import printable
+from orthocal.text import quote_path
 from orthocal.units import DRIVE_UNITS, show_limit, tidy
 
 UNCHANGED = "unchanged"
@@ -342,11 +341,6 @@ def _repeat_choice(calibration: Calibration) -> list[str]:
             limit = tidy(show_limit(p.prior_std) * p.edge_factor)
             options.append(f"--known {quote_path(f'{value}±{limit}')}")
     return options
-
-
-def quote_path(path: str | Path) -> str:
-    """A path or another word as it can be typed in a shell."""
-    return printable(shlex.quote(str(path)))
 
 
 def _indented(part: RenderableType) -> RenderableType:

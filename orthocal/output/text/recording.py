@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import shutil
 import textwrap
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name
 from orthocal.session.session import Conditions, Reading, Session, Setup
-from orthocal.text import printable, spans
+from orthocal.text import printable, quote_path, spans
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
 
 WIDEST = 100
@@ -452,7 +451,7 @@ class RecordingText:
             path: Path of the session as it was typed.
         """
         recording, session, rows = self._recording, self._session, self._recording.rows
-        command = printable(shlex.quote(path))
+        command = quote_path(path)
         if recording.missing:
             parts = []
             for setup in dict.fromkeys(self.name(rows[i]) for i in recording.missing):
@@ -486,7 +485,7 @@ class RecordingText:
                 f"or calibrate all sessions together:\n  {together}"
             )
             if session.offsets_from is not None:
-                entered = printable(shlex.quote(str(session.offsets_from)))
+                entered = quote_path(session.offsets_from)
                 following = f"Next:\n  orthocal validate {entered} {command}"
         return "\n".join([*(self.wrap(line) for line in lines), following])
 
