@@ -62,8 +62,9 @@ def accuracy(
     from orthocal.output.text.accuracy import (
         accuracy_json,
         expect_further_hour,
-        print_accuracy,
+        render_accuracy,
     )
+    from orthocal.output.text.layout import print_rich
 
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
@@ -90,7 +91,7 @@ def accuracy(
     def show() -> None:
         is_default = workspace is None and stated is None
         further = expect_further_hour(result, None if is_default else assessment)
-        print_accuracy(result, assessment, further)
+        print_rich(render_accuracy(result, assessment, further))
 
     deliver(lambda: accuracy_json(result, assessment), show, json=json)
 

@@ -115,15 +115,19 @@ def plan(
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
     """
     from orthocal.output.text.answer import calibrate_command
-    from orthocal.output.text.plan import describe_assumed_tip, plan_json
-    from orthocal.output.text.summary import print_summary
+    from orthocal.output.text.layout import print_rich
+    from orthocal.output.text.plan import describe_assumed_tip, plan_json, render_plan
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
     if out is not None:
         require_new_session(out, FILES, force=force)
     workers = options.workers or available_cores()
     chosen = _choose(subject, options, controller, workers=workers)
-    deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
+    deliver(
+        lambda: plan_json(chosen),
+        lambda: print_rich(render_plan(chosen, details=details)),
+        json=json,
+    )
     if assumed := describe_assumed_tip(chosen.equipment, chosen.session):
         put_note(assumed)
     if out is not None:

@@ -10,6 +10,7 @@ from orthocal.assessment.wording import (
     joined,
     mm,
     name_offsets,
+    named,
     note,
     plain,
     review,
@@ -168,7 +169,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
     where, action = "", "Measure again."
     if result.suspected:
         names = list(dict.fromkeys(session.readings[i].setup for i in result.suspected))
-        setups = f"setup{'s' * (len(names) > 1)} {joined(names)}"
+        setups = named("setup", names)
         lines = _lines(session, suspected).removesuffix(": ")
         where = f", most likely in {f'{lines} ({setups})' if lines else setups}"
         action = advise_repetition(session, suspected)
@@ -365,7 +366,7 @@ def _subject(session: Session, e: Explanation) -> str:
         return f"all readings of {e.scope} {e.names[0]}"
     if e.scope == "session":
         return "all readings"
-    return f"{'setup' if len(e.setups) == 1 else 'setups'} {joined(e.setups)}"
+    return named("setup", e.setups)
 
 
 def _text(session: Session, e: Explanation) -> str:
@@ -563,7 +564,7 @@ def _changed(session: Session, e: Explanation) -> str:
     verb = "moved" if e.drives else "changed"
     when = f"before session {e.sessions[0]}"
     if e.apart:
-        when = f"for session{'s' * (len(e.sessions) > 1)} {joined(e.sessions)} only"
+        when = f"for {named('session', e.sessions)} only"
     return f"the machine changed: {what} {verb}{_amount_of_change(session, e)} {when}"
 
 

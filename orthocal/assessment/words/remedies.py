@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined
+from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined, named
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
@@ -205,8 +205,7 @@ def _calibrate_present(session: Session, e: Explanation) -> str:
     """Clause with the command that calibrates the sessions since a change without earlier ones."""
     names = list(dict.fromkeys(session.labels))
     present = e.sessions if e.apart else names[names.index(e.sessions[0]) :]
-    which = f"session{'s' * (len(present) > 1)} {joined(present)}"
-    clause = f"calibrate {which} without the others"
+    clause = f"calibrate {named('session', present)} without the others"
     paths = [part.path for part in session.parts]
     if len(paths) != len(names) or None in paths:
         return clause

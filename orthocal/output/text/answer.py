@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Group, RenderableType
-from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -34,10 +33,10 @@ from orthocal.output.text.layout import (
     EXPANDED,
     bullets,
     counted,
+    indented,
     list_places,
     noted,
     plain,
-    print_rich,
     section,
     short_name,
     signed,
@@ -123,12 +122,12 @@ def _values(calibration: Calibration, assessment: Assessment) -> list[Renderable
     parts: list[RenderableType] = []
     if assessment.entries:
         parts += [
-            _indented(entry_table(calibration)),
-            *(_indented(Text(text)) for text in _entry_notes(calibration, assessment)),
+            indented(entry_table(calibration)),
+            *(indented(Text(text)) for text in _entry_notes(calibration, assessment)),
             Text(),
         ]
     if assessment.backlash:
-        parts += [_indented(render_backlash(calibration)), Text()]
+        parts += [indented(render_backlash(calibration)), Text()]
     return parts
 
 
@@ -165,11 +164,6 @@ def render_decision(assessment: Assessment, *, details: bool = False) -> Rendera
 def _describe(finding: Finding, decision: Decision) -> str:
     """Text of a finding, and its action if the decision does not contain it."""
     return finding.text if finding.action[1:] in decision.action else finding.words
-
-
-def print_decision(assessment: Assessment, *, details: bool = False) -> None:
-    """Print a decision about readings: in colour on a terminal."""
-    print_rich(render_decision(assessment, details=details))
 
 
 def render_headline(decision: Decision) -> Text:
@@ -341,10 +335,6 @@ def _repeat_choice(calibration: Calibration) -> list[str]:
             limit = tidy(show_limit(p.prior_std) * p.edge_factor)
             options.append(f"--known {quote_path(f'{value}±{limit}')}")
     return options
-
-
-def _indented(part: RenderableType) -> RenderableType:
-    return Padding(part, (0, 0, 0, 2))
 
 
 def render_subject(calibration: Calibration) -> RenderableType:
