@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, NamedTuple
 
@@ -39,6 +40,7 @@ from orthocal.io.files import (
     read_parts,
     write_file,
 )
+from orthocal.robot.model import name_coordinates
 from orthocal.text import comment_safe, shorten
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
@@ -547,10 +549,7 @@ def _describe_controller(
     """Note about the offsets in the controller, [m, rad], when the program runs."""
     from orthocal.assessment.assess import assessment_of
 
-    listed = []
-    for drive, value in zip(result.robot.drives, values, strict=True):
-        unit, factor = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(float(value) / factor, 3, sign=True)} {unit}")
+    listed = name_coordinates(result.robot.drives, values, partial(format_fixed, sign=True))
     keep = assessment_of(result).keeps_offsets
     state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:

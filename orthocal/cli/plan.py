@@ -194,12 +194,11 @@ def _missing_controller(session: orthocal.Session) -> str:
     """Lines about keys of the controller that a session does not state; "" if it states all."""
     from orthocal.robot.model import drive_keys
 
-    drives = session.robot.drives
-    keys, zeros = [], [0.0] * len(drives)
+    drives, keys = session.robot.drives, []
     if session.controller_offsets is None:
-        keys.append(drive_keys("offsets", drives, zeros))
+        keys.append(drive_keys("offsets", drives))
     if not session.compensation:
-        keys.append(drive_keys("backlash", drives, zeros))
+        keys.append(drive_keys("backlash", drives))
     if not keys:
         return ""
     head = "State what the controller corrects during the measurement, one number for each drive"

@@ -17,7 +17,12 @@ from orthocal.assessment.words.entries import describe_aligned
 from orthocal.io.documents import format_json
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.reachable_box import find_workspace
-from orthocal.measurement.motion.approach import approach_length, describe_approach
+from orthocal.measurement.motion.approach import (
+    AS_ARROWS_SHOW,
+    FROM_ONE_SIDE,
+    approach_length,
+    describe_approach,
+)
 from orthocal.output.sheet.gauge_position import name_tip
 from orthocal.output.text.accuracy import (
     NOTICEABLE,
@@ -274,14 +279,9 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     length = approach_length(session)
     stated = any(r.approach for r in session.readings)
     if any(tool_path(sensor) is None for sensor in sensors) and not stated:
-        words.append(
-            f"Approach every posture from the same side: the last {length} in one direction."
-        )
+        words.append(FROM_ONE_SIDE.format(length))
     if stated:
-        words.append(
-            f"Approach each posture as its arrows show: in the last {length} the displayed number "
-            "of the joint grows (↑) or falls (↓). The programs do this."
-        )
+        words.append(f"{AS_ARROWS_SHOW.format(length)} The programs do this.")
     return [
         *words,
         "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",

@@ -15,6 +15,8 @@ from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
 from orthocal.measurement.motion.approach import (
+    AS_ARROWS_SHOW,
+    FROM_ONE_SIDE,
     approach_length,
     common_approach,
     describe_approach,
@@ -26,13 +28,13 @@ from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
-from orthocal.robot.model import drive_keys
+from orthocal.robot.model import drive_keys, name_coordinates
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, quote_path, spans
-from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
+from orthocal.units import MM, format_fixed, to_mm, trim_zeros
 
 WIDEST = 100
 """Largest width of a line, [columns]."""
@@ -183,13 +185,8 @@ class RecordingText:
             f"{self._what_to_type()} It is stored at once. `help` lists the commands. "
             "Lines are those of the sheet and of readings.csv."
         )
-        length = approach_length(session)
-        parts.append(
-            f"Approach each posture as its arrows show: in the last {length} the displayed number "
-            "of the joint grows (↑) or falls (↓)."
-            if any(r.approach for r in rows)
-            else f"Approach every posture from the same side: the last {length} in one direction."
-        )
+        rule = AS_ARROWS_SHOW if any(r.approach for r in rows) else FROM_ONE_SIDE
+        parts.append(rule.format(approach_length(session)))
         return "\n".join(self.wrap(part) for part in parts)
 
     def _what_to_type(self) -> str:
@@ -307,11 +304,10 @@ class RecordingText:
         return "\n".join(lines)
 
     def _coordinates(self, posture: str, name: str) -> str:
-        guidance, parts = self._guidance, []
-        for drive, value in zip(self._session.robot.drives, guidance.joints[posture], strict=True):
-            unit, size = DRIVE_UNITS[drive.unit]
-            parts.append(f"{drive.name} {format_fixed(value / size, 3)} {unit}".replace(" ", GLUE))
-        lines = [self.wrap(f"{name}joints {', '.join(parts)}", indent="  ")]
+        guidance = self._guidance
+        joints = name_coordinates(self._session.robot.drives, guidance.joints[posture])
+        text = ", ".join(joint.replace(" ", GLUE) for joint in joints)
+        lines = [self.wrap(f"{name}joints {text}", indent="  ")]
         if posture in guidance.tool:
             values = zip("xyz", guidance.tool[posture], strict=True)
             tool = ", ".join(f"{axis}{GLUE}{format_fixed(v / MM, 3)}" for axis, v in values)
@@ -467,8 +463,7 @@ class RecordingText:
             return f"{self.wrap(state)}\nContinue with:\n  orthocal record {command}"
         lines = [f"All {counted(recording.count, 'reading')} are recorded."]
         if session.controller_offsets is None:
-            drives = session.robot.drives
-            keys = drive_keys("offsets", drives, [0.0] * len(drives))
+            keys = drive_keys("offsets", session.robot.drives)
             lines.append(
                 "State in session.yaml which offsets are active in the controller, one number per "
                 f"drive, such as `controller: {{{keys}}}`. Without them only their "
