@@ -397,7 +397,7 @@ def _text(session: Session, e: Explanation) -> str:
         "displaced gauge": lambda: _displaced(session, e),
         "displaced artefact": lambda: _displaced_artefact(session, e),
         "wrong dimension": lambda: _other_dimension(session, e),
-        "readjusted dimension": lambda: _readjusted(session, e),
+        "readjusted dimension": lambda: _other_dimension(session, e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
             f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
@@ -523,20 +523,15 @@ def _dimensions_mm(e: Explanation) -> tuple[float, float]:
 
 
 def _other_dimension(session: Session, e: Explanation) -> str:
-    """Clause about a wrong dimension with its true and stated size."""
+    """Clause about a wrong or readjusted dimension with its true and stated size."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
+    where, there = f" in {_subject(session, e)} is", ""
+    if e.kind == "readjusted dimension":
+        since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
+        where, there = f" was changed{since}: it is", " there"
     zeroed = f", or the dial was not zeroed at {stated:g} mm" * has_known_zero(session, e)
-    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm{zeroed}"
-
-
-def _readjusted(session: Session, e: Explanation) -> str:
-    """A dimension that differs from a session on, with both sizes."""
-    true, stated = _dimensions_mm(e)
-    what = e.names[0].rpartition(".")[2].removesuffix("_mm")
-    since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
-    zeroed = f", or the dial was not zeroed at {stated:g} mm" * has_known_zero(session, e)
-    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm{zeroed}"
+    return f"the {what}{where} {plain(true)} mm{there}, not {stated:g} mm{zeroed}"
 
 
 def _swapped(session: Session, e: Explanation) -> str:
