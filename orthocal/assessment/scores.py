@@ -111,7 +111,9 @@ def score_model(
     linearisation = fit.linearisation
     calibration = assemble_calibration(fit)
     tool = _assess_tool(calibration)
-    effective = _effective_parameters(fit)
+    effective = fit.information.posterior(
+        sigma=fit.sigma, precision=problem.prior_precision, at_bound=fit.at_bound
+    ).effective_parameters
     return ModelResult(
         model=problem.selection.label,
         n_free=problem.n_machine,
@@ -131,13 +133,6 @@ def _assess_tool(calibration: Calibration) -> ToolAccuracy | None:
         return assess_tool(calibration)
     except (ClosureError, RobotError):  # no tool, or no reachable workspace
         return None
-
-
-def _effective_parameters(fit: Fit) -> float:
-    """Effective number of parameters of a fit."""
-    return fit.information.posterior(
-        sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
-    ).effective_parameters
 
 
 def _score(

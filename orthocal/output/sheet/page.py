@@ -135,10 +135,9 @@ def _front(
     """The first page: checks of the machine, rules, and the list of setups."""
     robot = session.robot
     stops = [s for m in motions for s in m.stops if s.role == "reading"]
-    lead = (
-        f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}. "
-        f"Gauge: {_gauges(session)}."
-    )
+    gauges = "; ".join(_gauge(name, gauge) for name, gauge in session.gauges.items())
+    count = f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}"
+    lead = f"{count}. Gauge: {gauges}."
     several = len(session.gauges_with_readings) > 1
     headers = (
         *("", "setup", "measures", *(["gauge"] if several else []), "readings"),
@@ -169,6 +168,7 @@ def _front(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
         for text in ("Date, name", *_asked_once(session))
     )
+    with_bar = any(isinstance(s.sensor, BallBar) for s in session.setups.values())
     return (
         f"<header>{heading('Measuring sheet', level=1)}"
         f"{paragraph(f'{robot.name}: {session.title}' if session.title else robot.name)}"
@@ -179,7 +179,7 @@ def _front(
         + _numbered(_reading_rules(session, motions))
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3 + several)
-        + (_programs(options, with_bar=_has_bar(session)) if with_programs else "")
+        + (_programs(options, with_bar=with_bar) if with_programs else "")
     )
 
 
@@ -197,10 +197,6 @@ def _largest_difference(robot: Robot) -> str:
         limit = math.ceil((LIMIT * offset.prior_std + by_eye) / size)
         largest[unit] = max(largest.get(unit, 0), limit)
     return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
-
-
-def _has_bar(session: Session) -> bool:
-    return any(isinstance(s.sensor, BallBar) for s in session.setups.values())
 
 
 def _programs(options: ProgramOptions | None, *, with_bar: bool) -> str:
@@ -460,11 +456,6 @@ def _afterwards(session: Session, command: str) -> str:
 
 def _numbered(texts: list[str]) -> str:
     return "<ol>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ol>"
-
-
-def _gauges(session: Session) -> str:
-    """Name, range and resolution of the gauges."""
-    return "; ".join(_gauge(name, gauge) for name, gauge in session.gauges.items())
 
 
 def _gauge(name: str, gauge: Gauge) -> str:

@@ -41,6 +41,7 @@ from orthocal.output.text.layout import (
     short_name,
     signed,
     table_of,
+    table_of_records,
 )
 from orthocal.session.session import split_label
 from orthocal.text import quote_path
@@ -120,12 +121,10 @@ def render_answer(
 def _values(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
     """Values to enter, with notes."""
     parts: list[RenderableType] = []
+    unstated = [f.words for f in assessment.of_kind("controller not stated")]
     if assessment.entries:
-        parts += [
-            indented(entry_table(calibration)),
-            *(indented(Text(text)) for text in _entry_notes(calibration, assessment)),
-            Text(),
-        ]
+        notes = unstated or describe_columns(calibration)
+        parts += [indented(entry_table(calibration)), *(indented(Text(t)) for t in notes), Text()]
     if assessment.backlash:
         parts += [indented(render_backlash(calibration)), Text()]
     return parts
@@ -171,12 +170,6 @@ def render_headline(decision: Decision) -> Text:
     doubtful = decision.verdict == "enter" and decision.exit_code  # not confirmed
     headline = (decision.headline, STYLES["review" if doubtful else decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
-
-
-def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[str]:
-    """Notes on entering the values."""
-    unstated = assessment.of_kind("controller not stated")
-    return [unstated[0].words] if unstated else describe_columns(calibration)
 
 
 def describe_columns(calibration: Calibration) -> list[str]:
@@ -484,18 +477,19 @@ def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
     """
     assessment = assessment_of(calibration)
     keep = assessment.keeps_offsets
-    stated = any(e.active is not None for e in assessment.entries)
-    columns = ["now", "best" if keep else "new"] if stated else ["best" if keep else "add"]
     directions = {d.name: d.direction for d in calibration.robot.drives}
     counts_down = not keep and any(directions[e.drive] < 0 for e in assessment.entries)
     rows = []
     for e in assessment.entries:
-        factor = e.edge_factor
-        now = [] if e.active is None else [signed(e.active * factor)]
-        joint = [signed(directions[e.drive] * e.change * factor)] if counts_down else []
-        estimate = [signed(e.identified * factor)] if identified else []
-        half = e.held or plain(expanded_uncertainty(calibration, e) * factor)
-        rows.append((e.drive, *now, signed(e.best * factor), half, *joint, *estimate, e.edge_unit))
-    further = [*(["joint"] if counts_down else []), *(["identified"] if identified else [])]
-    headers = ("drive", *columns, "±", *further, "unit")
-    return table_of(headers, rows)
+        factor, best = e.edge_factor, "add"
+        row = {"drive": e.drive}
+        if e.active is not None:
+            row["now"], best = signed(e.active * factor), "new"
+        row["best" if keep else best] = signed(e.best * factor)
+        row["±"] = e.held or plain(expanded_uncertainty(calibration, e) * factor)
+        if counts_down:
+            row["joint"] = signed(directions[e.drive] * e.change * factor)
+        if identified:
+            row["identified"] = signed(e.identified * factor)
+        rows.append(row | {"unit": e.edge_unit})
+    return table_of_records(rows)

@@ -208,6 +208,11 @@ def table_of(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int
     return table
 
 
+def table_of_records(rows: Sequence[Mapping[str, str]]) -> Table:
+    """A table of rows with the same keys, which are its headers; empty without rows."""
+    return table_of(list(rows[0]) if rows else (), [list(row.values()) for row in rows])
+
+
 def _plain(cell: RenderableType) -> str:
     return cell.plain if isinstance(cell, Text) else str(cell)
 

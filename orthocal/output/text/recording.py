@@ -283,9 +283,9 @@ class RecordingText:
         return base_name(row.setup) if point else row.setup
 
     def value(self, index: int) -> str:
-        """Reading of a row, or the coordinates of its point, in mm."""
-        values = np.atleast_1d(self._recording.value(index))
-        return ", ".join(show_mm(v) for v in values.tolist())
+        """Reading of a row, or the coordinates of its point, in mm, with two decimals or more."""
+        values = np.atleast_1d(self._recording.value(index)).tolist()
+        return ", ".join(trim_zeros(f"{to_mm(value) + 0.0:.6f}") for value in values)
 
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
@@ -483,11 +483,6 @@ class RecordingText:
                 entered = quote_path(session.offsets_from)
                 following = f"Next:\n  orthocal validate {entered} {command}"
         return "\n".join([*(self.wrap(line) for line in lines), following])
-
-
-def show_mm(value: float) -> str:
-    """A reading in mm with all its decimals, two at least."""
-    return trim_zeros(f"{to_mm(value) + 0.0:.6f}")
 
 
 def _name_gauge(setup: Setup, *, stand: bool = False) -> str:
