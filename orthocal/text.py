@@ -6,9 +6,11 @@ And lists of numbers.
 from __future__ import annotations
 
 import re
+import shlex
 import unicodedata
 from collections.abc import Sequence
 from itertools import groupby
+from pathlib import Path
 
 _ESCAPED = frozenset({"Cc", "Cf", "Co", "Cs", "Zl", "Zp"})
 """Unicode categories of control, format, private-use and surrogate characters and of line and
@@ -42,6 +44,11 @@ def printable(text: str, *, keep: str = "") -> str:
     if _ORDINARY.fullmatch(text):
         return text
     return "".join(c if c in keep or not _is_escaped(c) else _escape(c) for c in text)
+
+
+def quote_path(path: str | Path) -> str:
+    """A path or another word as it can be typed in a shell."""
+    return printable(shlex.quote(str(path)))
 
 
 def control_character(text: str) -> str | None:

@@ -105,6 +105,6 @@ def trim_zeros(number: str) -> str:
     return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
 
 
-def format_fixed(value: float, decimals: int, *, sign: bool = False) -> str:
+def format_fixed(value: float, decimals: int = 3, *, sign: bool = False) -> str:
     """Number with fixed decimals, and without a negative zero."""
     return f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}"

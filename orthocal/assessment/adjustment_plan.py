@@ -360,9 +360,6 @@ class _Search:
         normal = effects.T @ effects + np.diag((LEVER_SHARE * self._column_norms[chosen]) ** 2)
         return np.asarray(-np.linalg.solve(normal, effects.T @ error_effects))
 
-    def _covariance(self) -> Array:
-        return self.calibration.error_covariances[0]
-
     def uncertainties(self, chosen: Sequence[int]) -> Array:
         """Expanded uncertainties of the best amounts, shape (n_chosen,), [m]."""
         stds = propagate_stds(self._gain(chosen), self.calibration.error_covariances)
@@ -373,9 +370,8 @@ class _Search:
         if not chosen:
             return 0.0
         displacement = self.effects[:, chosen] @ self._gain(chosen)
-        return math.sqrt(
-            max(float(np.trace(displacement @ self._covariance() @ displacement.T)), 0.0)
-        )
+        stds = propagate_stds(displacement, self.calibration.error_covariances[:1])
+        return float(np.linalg.norm(stds))
 
     def order(
         self, chosen: Sequence[int], amounts: Array, before: float, after: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -108,9 +109,7 @@ class Comparison:
             and {
                 "model": recommendation.model,
                 "tolerance_scale": recommendation.tolerance_scale,
-                "log_evidence": {
-                    e.model: finite_or_none(e.log_evidence) for e in recommendation.evidence
-                },
+                "log_evidence": {m: finite_or_none(v) for m, v in recommendation.evidence.items()},
             },
             "effects": None if self.effects is None else _effects_document(self.effects),
         }
@@ -159,9 +158,10 @@ def compare_models(
     results, undetermined = _score_models(build, names, noises, options, report)
     if judgement.verdict != "enter":
         results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)
+    several = len({r.cycle for r in session.readings}) > 1
     comparison = Comparison(
         title=session.title,
-        labels=_label_rows(session),
+        labels=tuple(r.label + (f", cycle {r.cycle}" if several else "") for r in session.readings),
         noises=noises,
         independent=results[0].calibration.identifiability.n_readings if results else 0,
         results=results,
@@ -202,12 +202,6 @@ def _recommend(comparison: Comparison, session: Session, models: Sequence[str]) 
     )
 
 
-def _label_rows(session: Session) -> tuple[str, ...]:
-    """Labels of the readings, with the cycle if there are several."""
-    several = len({r.cycle for r in session.readings}) > 1
-    return tuple(r.label + (f", cycle {r.cycle}" if several else "") for r in session.readings)
-
-
 def _score_models(
     build: Callable[..., CalibrationProblem],
     models: Sequence[str],
@@ -242,7 +236,7 @@ def _score_with_prior(
     except NotIdentifiableError:
         with_prior = build(prior=True)
     try:
-        return score_model(with_prior, noises=noises, by_choice=False, options=options)
+        return score_model(with_prior, noises=noises, options=options)
     except NotIdentifiableError as e:
         return Undetermined(problem.selection.label, problem.n_machine, e.problem)
 
@@ -314,20 +308,14 @@ def _gather_repeats(
         SessionError: If a session is of another robot, or is one of the compared sessions.
     """
     others = [s.with_tolerances(tolerances) for s in gather_sessions(repeat)]
-    for other in others:
-        _require_another(other, compared)
-    return others
-
-
-def _require_another(other: Session, sessions: Sequence[Session]) -> None:
-    """Refuse a session of `repeat` that is of another robot, or is one of the compared sessions."""
-    where = None if other.path is None else str(other.path)
-    for session in sessions:
+    for other, session in itertools.product(others, compared):
         require_same_robot(other, session)
         if other.was_read_from(session.sha256):
             raise SessionError(
-                "is the same session: its residuals repeat by definition", where=where
+                "is the same session: its residuals repeat by definition",
+                where=None if other.path is None else str(other.path),
             )
+    return others
 
 
 def find_known_noises(session: Session) -> dict[str, Noise]:
@@ -379,8 +367,8 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
     return {
         "model": result.model,
         "n_free": result.n_free,
-        "rank": result.rank,
-        "spare": result.redundancy,
+        "rank": result.calibration.structural_rank,
+        "spare": result.calibration.redundancy,
         "effective_parameters": result.effective,
         "linearised": score(result.linearised),
         "exact": score(result.exact),

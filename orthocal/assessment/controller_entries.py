@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -109,7 +109,7 @@ def compute_backlash(
     """
     by_name = {estimate.name: estimate for estimate in calibration.parameters}
     active = calibration.compensated_backlash.tolist()
-    entries, changes, determined, limited = [], [], [], []
+    entries, changes = [], []
     for drive, active_backlash in zip(calibration.robot.drives, active, strict=True):
         estimate = by_name.get(f"{drive.name}.backlash")
         if estimate is None or not (estimate.free or estimate.value):
@@ -120,11 +120,10 @@ def compute_backlash(
             drive.name, drive.unit, active_backlash, value, value, std, std_scatter
         )
         uncertainty = expanded_uncertainty(calibration, entry)
+        determined = max(value, abs(value - active_backlash)) > uncertainty
         entries.append(entry)
-        changes.append(_backlash_change(entry))
-        determined.append(max(value, abs(value - active_backlash)) > uncertainty)
-        limited.append(readings_limit(calibration, f"{drive.name}.backlash"))
-    entering = _choose_changes(calibration, tool, changes, determined, limited)
+        changes.append(_Change({f"{drive.name}.backlash": entry.change}, determined))
+    entering = _choose_changes(calibration, tool, changes)
     return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 
 
@@ -134,17 +133,17 @@ def readings_limit(calibration: Calibration, *names: str) -> bool:
     return any(not p.free or p.std < DETERMINED * p.prior_std for p in estimates)
 
 
-def _backlash_change(entry: BacklashEntry) -> dict[str, float]:
-    """Parameter of the backlash of a drive to its change, [SI]."""
-    return {f"{entry.drive}.backlash": entry.change}
+class _Change(NamedTuple):
+    """Change of what the controller corrects on one drive."""
+
+    amounts: Mapping[str, float]
+    """Parameter to its change, [SI]."""
+    determined: bool
+    """Whether the change is larger than its expanded uncertainty."""
 
 
 def _choose_changes(
-    calibration: Calibration,
-    tool: CalibratedTool | None,
-    changes: Sequence[Mapping[str, float]],
-    determined: Sequence[bool],
-    limited: Sequence[bool],
+    calibration: Calibration, tool: CalibratedTool | None, changes: Sequence[_Change]
 ) -> Sequence[bool]:
     """Decide which changes are entered: the determined ones, and others that lower the tool error.
 
@@ -154,17 +153,13 @@ def _choose_changes(
     Args:
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
-        changes: Changes of the controller's correction, each parameter to amount, [SI].
-        determined: Whether each change is larger than its expanded uncertainty.
-        limited: Whether the readings limit each change (`readings_limit`).
+        changes: Changes of the controller's correction.
     """
-    entered = list(limited)
+    entered = [readings_limit(calibration, *change.amounts) for change in changes]
     omitted: dict[str, float] = {}
-    undetermined = [
-        i for i, known in enumerate(zip(determined, limited, strict=True)) if known == (False, True)
-    ]
-    for i in sorted(undetermined, key=lambda i: max(map(abs, changes[i].values()), default=0.0)):
-        omitted |= changes[i]
+    undetermined = [i for i, c in enumerate(changes) if entered[i] and not c.determined]
+    for i in sorted(undetermined, key=lambda i: max(map(abs, changes[i].amounts.values()))):
+        omitted |= changes[i].amounts
         if _changes_tool(calibration, tool, omitted):
             break
         entered[i] = False
@@ -211,7 +206,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
     screw = find_screw_effect(robot)
     if screw is None:
         return ()
-    errors, entries, determined, limited = calibration.errors, [], [], []
+    errors, entries, changes = calibration.errors, [], []
     for drive, active in zip(robot.drives, _compensated_screws(calibration, screw), strict=True):
         names = [f"{drive.name}.{kind}" for kind in SCREW_COMPONENTS]
         identified = np.array([errors.get(name, 0.0) for name in names])
@@ -219,13 +214,13 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
             continue
         uncertainty = _amplitude_uncertainty(calibration, names, identified)
         change_uncertainty = _amplitude_uncertainty(calibration, names, identified - active)
-        entries.append(ScrewEntry(drive.name, active, identified, identified, uncertainty))
+        entry = ScrewEntry(drive.name, active, identified, identified, uncertainty)
         amplitudes = np.linalg.norm([identified, identified - active], axis=1)
         limits = ELLIPSE_FACTOR * np.array([uncertainty, change_uncertainty])
-        determined.append(bool((amplitudes > limits).any()))
-        limited.append(readings_limit(calibration, *names))
-    changes = [_screw_parameters(e.drive, e.change) for e in entries]
-    entering = _choose_changes(calibration, find_tool(calibration), changes, determined, limited)
+        entries.append(entry)
+        amounts = _screw_parameters(drive.name, entry.change)
+        changes.append(_Change(amounts, bool((amplitudes > limits).any())))
+    entering = _choose_changes(calibration, find_tool(calibration), changes)
     return tuple(
         e if enter else replace(e, enter=e.active)
         for e, enter in zip(entries, entering, strict=True)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.effects.loading import measurable_effects
+from orthocal.effects.protocol import Effect
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.session.session import Session
 from orthocal.statistics.information import VAGUE, Information
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import LIMIT, Unit
@@ -38,6 +40,14 @@ class EffectLimits:
         return self.after < DETERMINED * self.before
 
 
+def parameter_units(effect: Effect, session: Session) -> dict[str, Unit]:
+    """Parameters of an effect, those of each setup included, with their SI units."""
+    of_setups = {
+        f"setup.{setup}.{e.name}": e.unit for e in effect.setup_errors for setup in session.setups
+    }
+    return {e.name: e.unit for e in effect.errors} | of_setups
+
+
 def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits, ...]:
     """Limits of the parameters of effects after the readings of a problem.
 
@@ -61,12 +71,7 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
     before = LIMIT * problem.theta_scale
     limits = []
     for effect in effects:
-        units = {e.name: e.unit for e in effect.errors}
-        units |= {
-            f"setup.{setup}.{e.name}": e.unit
-            for e in effect.setup_errors
-            for setup in problem.session.setups
-        }
+        units = parameter_units(effect, problem.session)
         for unit in dict.fromkeys(units.values()):
             columns = [i for i, n in enumerate(problem.free) if units.get(n) == unit]
             if columns:

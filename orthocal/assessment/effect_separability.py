@@ -18,7 +18,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.assessment.effect_limits import find_limits
+from orthocal.assessment.effect_limits import find_limits, parameter_units
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.loading import (
@@ -121,7 +121,10 @@ def _inseparable(session: Session) -> Iterator[Finding]:
     model = linear_model(session)
     linearisation = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
-    indices_of_effects = _members(session, model.problem.free)
+    indices_of_effects = {
+        name: [i for i, n in enumerate(model.problem.free) if n in parameter_units(effect, session)]
+        for name, effect in effects.items()
+    }
     effect_columns = [i for indices in indices_of_effects.values() for i in indices]
     effect_slopes, other_slopes = (
         linearisation.jacobian[:, effect_columns],
@@ -147,16 +150,6 @@ def _inseparable(session: Session) -> Iterator[Finding]:
             yield words.effects_alike(
                 effects[one], effects[other], [labels[p] for p, _ in pairs], partners
             )
-
-
-def _members(session: Session, free: tuple[str, ...]) -> dict[str, list[int]]:
-    """Indices of the parameters of each effect among the free parameters."""
-    members: dict[str, list[int]] = {}
-    for effect in measurable_effects(session.robot):
-        names = {e.name for e in effect.errors}
-        names |= {f"setup.{s}.{e.name}" for s in session.setups for e in effect.setup_errors}
-        members[effect.name] = [i for i, name in enumerate(free) if name in names]
-    return members
 
 
 def _explained(

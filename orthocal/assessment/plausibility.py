@@ -86,7 +86,8 @@ def find_implausible(session: Session, *, explained: bool = False) -> tuple[Find
     """
     findings: list[Finding | None] = [_legs(session.robot)]
     for part in split_sessions(session):
-        problem = build_problem(part, model="offsets") if _has_offsets(part.robot) else None
+        has_offsets = "offsets" in part.robot.parameters.models
+        problem = build_problem(part, model="offsets") if has_offsets else None
         findings += [_check_distances(part), *(() if explained else find_finer(part))]
         if problem is not None and part.readings:
             findings += _by_model(part, problem, fit=not explained)
@@ -213,10 +214,6 @@ def are_finer(values: ArrayLike, gauge: Gauge) -> NDArray[np.bool_]:
     """
     steps = np.asarray(values) / (gauge.resolution or np.inf)
     return np.asarray(np.abs(steps - np.round(steps)) > STEP_TOLERANCE)
-
-
-def _has_offsets(robot: Robot) -> bool:
-    return "offsets" in robot.parameters.models
 
 
 def _by_model(

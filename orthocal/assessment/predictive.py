@@ -36,6 +36,7 @@ from orthocal.statistics.distributions import (
     least_number,
     median_of_largest,
 )
+from orthocal.statistics.information import square_root
 from orthocal.statistics.noise import FEW_DOF
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
@@ -107,8 +108,7 @@ def _root_of_covariance(calibration: Calibration, fit: Fit) -> Array:
     covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
     scale = problem.theta_scale[:n]
     covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(scale, scale)
-    variances, directions = np.linalg.eigh(covariance)
-    return np.asarray(directions * np.sqrt(np.maximum(variances, 0.0)))
+    return square_root(covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

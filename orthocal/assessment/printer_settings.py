@@ -116,31 +116,47 @@ class SettingRow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Targets:
-    """Carriages of the calibrated machine, and positions of its nozzle above the bed.
+class _Points:
+    """Carriages of the calibrated machine at positions of its nozzle.
 
     Derivatives are in the axes of the bed, with respect to the n free errors of the machine and
     nuisance parameters, or with respect to the carriages.
     """
 
     points: Array
-    """Positions of the nozzle in the workspace, shape (K, 3), [m]."""
-    weights: Array
-    """Weights of these points, shape (K,)."""
+    """Positions of the nozzle, shape (K, 3), [m]."""
     carriages: Array
-    """Coordinates of the carriages at these points, shape (K, 3), [m]."""
-    layer_points: Array
-    """Positions of the nozzle on the bed, shape (M, 3), [m]."""
-    layer_carriages: Array
-    """Coordinates of the carriages at the points on the bed, shape (M, 3), [m]."""
+    """Coordinates of the carriages, shape (K, 3), [m]."""
     jacobian: Array
     """Derivative of the points with respect to errors, shape (K, 3, n), [m per SI unit]."""
-    layer_jacobian: Array
-    """Derivative of the points on the bed with respect to errors, shape (M, 3, n)."""
     by_drives: Array
     """Derivative of the points with respect to the carriages, shape (K, 3, 3), [1]."""
-    layer_by_drives: Array
-    """Derivative of the points on the bed with respect to the carriages, shape (M, 3, 3)."""
+
+    def deviation(self, settings: DeltaSettings, change: Array) -> Array:
+        """Computed minus real positions with settings, shape (K, 3), [m].
+
+        Args:
+            settings: The settings.
+            change: Change of the homed carriages, shape (3,), [m].
+        """
+        return np.asarray(settings.forward(self.carriages + change) - self.points)
+
+    def deviation_gain(self, settings: DeltaSettings, change: Array) -> Array:
+        """Change of the deviations by errors at constant real positions, shape (K, 3, n)."""
+        by_carriages = _differentiate(settings, self.carriages + change)
+        return np.asarray(by_carriages @ np.linalg.solve(self.by_drives, self.jacobian))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Targets:
+    """Points at which settings of a firmware are fitted."""
+
+    space: _Points
+    """Points over the workspace."""
+    weights: Array
+    """Weights of these points, shape (K,)."""
+    layer: _Points
+    """Points of the first layer, on the bed."""
 
 
 def fit_firmware(
@@ -237,16 +253,11 @@ def _setting_gain(
         jacobian: Derivative of the residuals with respect to the unknowns, shape (m, k).
         homed_change: Change of the homed carriages, shape (3,), [m].
     """
-    n = targets.jacobian.shape[-1]
-    computed, layer = (
-        _differentiate(settings, carriages + homed_change) @ np.linalg.solve(by_drives, errors)
-        for carriages, by_drives, errors in (
-            (targets.carriages, targets.by_drives, targets.jacobian),
-            (targets.layer_carriages, targets.layer_by_drives, targets.layer_jacobian),
-        )
-    )
+    n = targets.space.jacobian.shape[-1]
+    computed = targets.space.deviation_gain(settings, homed_change)
+    heights = targets.layer.deviation_gain(settings, homed_change)[:, 2]
     change = np.sqrt(targets.weights)[:, None, None] * computed
-    layer = math.sqrt(FIRST_LAYER / len(targets.layer_points)) * layer[:, 2]
+    layer = math.sqrt(FIRST_LAYER / len(heights)) * heights
     change = np.concatenate([change.reshape(-1, n), layer])
     gain = _unknown_columns(settings.firmware) @ np.linalg.lstsq(jacobian, change, rcond=None)[0]
     rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
@@ -322,26 +333,15 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
             [f"{d.name}.offset" for d in robot.drives],
         )
     )
-    jacobians = [
-        np.concatenate(
-            [tilt.T @ to_errors(c), -np.einsum("ijk,nj->nik", rotation_derivative, p)], axis=2
-        )
-        for p, c in ((space.points, carriages), (layer, layer_carriages))
-    ]
-    by_drives = [tilt.T @ to_drives(c) for c in (carriages, layer_carriages)]
+
+    def place(points: Array, carriages: Array) -> _Points:
+        by_bed = -np.einsum("ijk,nj->nik", rotation_derivative, points)
+        jacobian = np.concatenate([tilt.T @ to_errors(carriages), by_bed], axis=2)
+        return _Points(points, carriages, jacobian, tilt.T @ to_drives(carriages))
+
     if accuracy.after is not None:
         layer_uncertainty = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
-    targets = _Targets(
-        points=space.points,
-        weights=space.weights,
-        carriages=carriages,
-        layer_points=layer,
-        layer_carriages=layer_carriages,
-        jacobian=jacobians[0],
-        layer_jacobian=jacobians[1],
-        by_drives=by_drives[0],
-        layer_by_drives=by_drives[1],
-    )
+    targets = _Targets(place(space.points, carriages), space.weights, place(layer, layer_carriages))
     return targets, layer_uncertainty
 
 
@@ -419,10 +419,10 @@ def _residuals(targets: _Targets, present: DeltaSettings, x: Array) -> Array:
 
     settings = _apply_changes(present, x)
     change = np.array(settings.homed) - present.homed
-    aligned = targets.points @ Rotation.from_euler("z", x[9]).as_matrix().T
+    aligned = targets.space.points @ Rotation.from_euler("z", x[9]).as_matrix().T
     aligned[:, :2] += x[10:12]
-    error = settings.forward(targets.carriages + change) - aligned
-    heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
+    error = settings.forward(targets.space.carriages + change) - aligned
+    heights = targets.layer.deviation(settings, change)[:, 2]
     weighted = np.sqrt(targets.weights)[:, None] * error
     return np.concatenate([weighted.ravel(), math.sqrt(FIRST_LAYER / len(heights)) * heights])
 
@@ -432,16 +432,16 @@ def _evaluate(targets: _Targets, settings: DeltaSettings, change: Array) -> Firm
 
     The best translation in x and y and rotation about z are removed from the tool errors.
     """
-    error = settings.forward(targets.carriages + change) - targets.points
+    error = targets.space.deviation(settings, change)
     by_alignment = np.zeros((len(error), 3, 3))  # with respect to x, y and the rotation
     by_alignment[:, 0, 0] = by_alignment[:, 1, 1] = 1.0
-    by_alignment[:, 0, 2] = -targets.points[:, 1]
-    by_alignment[:, 1, 2] = targets.points[:, 0]
+    by_alignment[:, 0, 2] = -targets.space.points[:, 1]
+    by_alignment[:, 1, 2] = targets.space.points[:, 0]
     root = np.sqrt(np.repeat(targets.weights, 3))[:, None]
     columns, flat = by_alignment.reshape(-1, 3), error.reshape(-1, 1)
     alignment = np.linalg.lstsq(root * columns, root * flat, rcond=None)[0]
     lengths = np.linalg.norm((flat - columns @ alignment).reshape(-1, 3), axis=1)
-    heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
+    heights = targets.layer.deviation(settings, change)[:, 2]
     return FirmwareError(
         tool_rms=math.sqrt(float(targets.weights @ lengths**2)),
         tool_largest=float(lengths.max()),

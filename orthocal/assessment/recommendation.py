@@ -14,7 +14,7 @@ evidence is integrated over σ with a broad prior.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -48,29 +48,20 @@ TRIAL_SCALE_SPREAD = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ModelEvidence:
-    """Evidence for one model."""
-
-    model: str
-    log_evidence: float
-    """ln p(y | M) minus that of the complete model; NaN if it cannot be computed."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Recommendation:
     """Recommended model and the evidence for it."""
 
     model: str
     tolerance_scale: float
     """Recommended tolerance scale; 1 unless the evidence for another one is strong."""
-    evidence: tuple[ModelEvidence, ...]
-    """Evidence of every model relative to the complete model."""
+    evidence: Mapping[str, float]
+    """Model to ln p(y | M) minus that of the complete model; NaN if it cannot be computed."""
     scale_evidence: float
     """Log evidence of this scale relative to the stated tolerances; 0 if the scale is 1."""
 
     def log_evidence_of(self, model: str) -> float:
         """Log evidence of a model relative to the complete model; NaN if it was not computed."""
-        return next((e.log_evidence for e in self.evidence if e.model == model), math.nan)
+        return self.evidence.get(model, math.nan)
 
 
 def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendation:
@@ -98,25 +89,22 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
     complete = complete_model(parameters)
     names = [m for m in dict.fromkeys(models or parameters.models) if m != complete]
     reference, by_scale = compute_log_evidence(session, complete)
-    evidence = [ModelEvidence(complete, 0.0)]
+    evidence = {}
     for name in names:
         try:
-            evidence.append(ModelEvidence(name, compute_log_evidence(session, name)[0] - reference))
+            evidence[name] = compute_log_evidence(session, name)[0] - reference
         except OrthocalError:
-            evidence.append(ModelEvidence(name, math.nan))
+            evidence[name] = math.nan
     best = int(np.argmax(by_scale + log_normal(TRIAL_SCALES, TRIAL_SCALE_SPREAD)))
     gain = float(by_scale[best] - reference)  # without the prior, which only selects the scale
-    best_smaller = max(
-        (e for e in evidence[1:] if math.isfinite(e.log_evidence)),
-        key=lambda e: e.log_evidence,
-        default=None,
-    )
-    required = max(STRONG, gain - NEARLY_EQUAL)
-    if best_smaller is not None and best_smaller.log_evidence >= required:
-        return Recommendation(best_smaller.model, 1.0, tuple(evidence), 0.0)
+    sufficient = max(STRONG, gain - NEARLY_EQUAL)
+    supported = [name for name, value in evidence.items() if value >= sufficient]
+    evidence = {complete: 0.0, **evidence}
+    if supported:
+        return Recommendation(max(supported, key=evidence.__getitem__), 1.0, evidence, 0.0)
     if gain < STRONG:
-        return Recommendation(complete, 1.0, tuple(evidence), 0.0)
-    return Recommendation(complete, float(TRIAL_SCALES[best]), tuple(evidence), gain)
+        return Recommendation(complete, 1.0, evidence, 0.0)
+    return Recommendation(complete, float(TRIAL_SCALES[best]), evidence, gain)
 
 
 def compute_log_evidence(

@@ -10,6 +10,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.calibration.calibration import Calibration
+from orthocal.statistics.information import square_root
 
 MIN_LISTED = 0.1
 """Smallest part of a parameter in a combination that is listed, in prior standard deviations."""
@@ -67,7 +68,7 @@ def rank_errors(
         names: Names of the parameters.
         count: Number of combinations.
     """
-    root = _square_root(covariance)
+    root = square_root(covariance)
     effect = field @ root
     _, directions = np.linalg.eigh(np.einsum("k,kin,kim->nm", weights, effect, effect))
     errors = []
@@ -88,9 +89,3 @@ def rank_errors(
             )
         )
     return tuple(errors)
-
-
-def _square_root(covariance: Array) -> Array:
-    """Matrix R with R Rᵀ equal to a covariance, which may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -71,8 +71,6 @@ class ModelResult:
     """Effective number of parameters."""
     prior: bool
     """True if the tolerances are used as a prior."""
-    by_choice: bool
-    """False if the prior is used only because the readings do not determine the model."""
     linearised: Score
     exact: Score
     calibration: Calibration
@@ -80,16 +78,6 @@ class ModelResult:
     """Tool errors; None for a robot without a tool centre point."""
     linearisation_cost: ErrorStatistics | None
     """Difference of the tool position between both estimates after alignment."""
-
-    @property
-    def rank(self) -> int:
-        """See `Calibration.structural_rank`."""
-        return self.calibration.structural_rank
-
-    @property
-    def redundancy(self) -> float:
-        """See `Calibration.redundancy`."""
-        return self.calibration.redundancy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +93,6 @@ def score_model(
     problem: CalibrationProblem,
     *,
     noises: Mapping[str, Noise],
-    by_choice: bool = True,
     options: SolverOptions | None = None,
 ) -> ModelResult:
     """Identify one model by both methods and score it.
@@ -113,7 +100,6 @@ def score_model(
     Args:
         problem: Problem with the parameters of the model free.
         noises: Known noise of each gauge for χ².
-        by_choice: See `ModelResult.by_choice`.
         options: Solver and its options.
 
     Raises:
@@ -125,13 +111,14 @@ def score_model(
     linearisation = fit.linearisation
     calibration = assemble_calibration(fit)
     tool = _assess_tool(calibration)
-    effective = _effective_parameters(fit)
+    effective = fit.information.posterior(
+        sigma=fit.sigma, precision=problem.prior_precision, at_bound=fit.at_bound
+    ).effective_parameters
     return ModelResult(
         model=problem.selection.label,
         n_free=problem.n_machine,
         effective=effective,
         prior=bool(problem.machine_selection.prior.any()),
-        by_choice=by_choice,
         linearised=_score(fit, linearisation, "linearised", noises, effective),
         exact=_score(fit, linearisation, "exact", noises, effective),
         calibration=calibration,
@@ -146,13 +133,6 @@ def _assess_tool(calibration: Calibration) -> ToolAccuracy | None:
         return assess_tool(calibration)
     except (ClosureError, RobotError):  # no tool, or no reachable workspace
         return None
-
-
-def _effective_parameters(fit: Fit) -> float:
-    """Effective number of parameters of a fit."""
-    return fit.information.posterior(
-        sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
-    ).effective_parameters
 
 
 def _score(

@@ -51,6 +51,7 @@ from orthocal.kinematics.conditions import (
 from orthocal.kinematics.reachable_box import no_workspace_error
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
+from orthocal.statistics.information import square_root
 
 MOST_POINTS = 5_000
 """Largest number of points that are assessed together; each needs 40 kB. `accuracy_rows` has no
@@ -181,25 +182,18 @@ def measure_uncertainty(
         workspace: The points and their weights.
         positions: Tool positions, shape (K, 3), [m].
     """
-    fields = {
-        "absolute": jacobian,
-        "relative": workspace.remove_translation(jacobian),
-        "aligned": workspace.remove_motion(jacobian, positions),
-    }
-    n = len(covariance)
-    covariances = {
-        name: (j.reshape(-1, n) @ covariance).reshape(j.shape) @ j.transpose(0, 2, 1)
-        for name, j in fields.items()
-    }
-    sizes = {name: _normal_statistics(c, workspace) for name, c in covariances.items()}
-    few = len(positions) < FEWEST_ALIGNED
-    return ToolUncertainty(
-        covariance=covariances["absolute"],
-        aligned_covariance=covariances["relative" if few else "aligned"],
-        sizes=ToolErrorStatistics(
-            None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]
-        ),
-    )
+
+    def propagate(j: Array) -> Array:
+        n = len(covariance)
+        return (j.reshape(-1, n) @ covariance).reshape(j.shape) @ j.transpose(0, 2, 1)
+
+    absolute, relative = propagate(jacobian), propagate(workspace.remove_translation(jacobian))
+    aligned, sizes_aligned = relative, None
+    if len(positions) >= FEWEST_ALIGNED:
+        aligned = propagate(workspace.remove_motion(jacobian, positions))
+        sizes_aligned = _normal_statistics(aligned, workspace)
+    sizes = [_normal_statistics(c, workspace) for c in (relative, absolute)]
+    return ToolUncertainty(absolute, aligned, ToolErrorStatistics(sizes_aligned, *sizes))
 
 
 def measure_deviations(
@@ -421,8 +415,7 @@ def _length_percentile(field: Array, workspace: Workspace) -> float:
 def _sampled_percentile(covariances: Array, workspace: Workspace) -> float:
     """95 % quantile of the lengths of normal errors by sampling; covariances (K, 3, 3)."""
     interpolated, weights = workspace.interpolate_to_cells(covariances)
-    values, vectors = np.linalg.eigh(interpolated)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    roots = square_root(interpolated)
     samples = np.random.default_rng(0).normal(size=(3, SAMPLES))
     lengths = np.linalg.norm(roots @ samples, axis=1)
     shares = np.broadcast_to(weights[:, None] / SAMPLES, lengths.shape)

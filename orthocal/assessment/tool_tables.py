@@ -63,7 +63,8 @@ def forward_blocks(
         Chunks of shape (n, 3), [m].
     """
     robot = calibration.robot
-    closure = _closure(calibration, conditions)
+    use = conditions or UseConditions()
+    closure = LoopClosure(robot, fixed=calibration.errors, conditions=use)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         failures.update(find_beyond_travel(robot, rows, names))
@@ -85,18 +86,11 @@ def inverse_blocks(
     Yields:
         Chunks of drive coordinates of encoders, shape (n, n_drives), [m, rad].
     """
-    closure = _closure(calibration, conditions)
-
-    def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
-        return closure.inverse(rows, names=names, failures=failures)
-
-    yield from _by_chunks(evaluate, blocks)
-
-
-def _closure(calibration: Calibration, conditions: UseConditions | None) -> LoopClosure:
-    """Loop closures of the calibrated machine."""
     use = conditions or UseConditions()
-    return LoopClosure(calibration.robot, fixed=calibration.errors, conditions=use)
+    closure = LoopClosure(calibration.robot, fixed=calibration.errors, conditions=use)
+    yield from _by_chunks(
+        lambda rows, names, failures: closure.inverse(rows, names=names, failures=failures), blocks
+    )
 
 
 def accuracy_rows(

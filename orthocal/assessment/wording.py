@@ -127,7 +127,7 @@ def signed(value: float, decimals: int = 3) -> str:
 def um(value: float) -> str:
     """Length in µm; one decimal below 20 µm."""
     size = value / UM
-    return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
+    return plain(size, 0 if abs(size) >= 20.0 else 1)
 
 
 def name_offsets(drives: Sequence[str], *, firmware: bool) -> str:
@@ -140,6 +140,11 @@ def name_offsets(drives: Sequence[str], *, firmware: bool) -> str:
 def counted(count: int, noun: str) -> str:
     """Number with a noun, such as "1 reading" or "2 readings"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def named(noun: str, names: Sequence[str]) -> str:
+    """Names with their noun, such as "setup yx" or "setups yx and zx"."""
+    return f"{noun}{'s' * (len(names) > 1)} {joined(names)}"
 
 
 def times(ratio: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.printing import deliver, print_rows, put_note
 from orthocal.errors import ClosureError, SessionError
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 if TYPE_CHECKING:
@@ -58,8 +58,9 @@ def accuracy(
     from orthocal.output.text.accuracy import (
         accuracy_json,
         expect_further_hour,
-        print_accuracy,
+        render_accuracy,
     )
+    from orthocal.output.text.layout import print_rich
 
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
@@ -84,7 +85,7 @@ def accuracy(
     def show() -> None:
         is_default = workspace is None and stated is None
         further = expect_further_hour(result, None if is_default else assessment)
-        print_accuracy(result, assessment, further)
+        print_rich(render_accuracy(result, assessment, further))
 
     deliver(lambda: accuracy_json(result, assessment), show, json=json)
 
@@ -106,7 +107,7 @@ def _print_points(
 
     rows = accuracy_rows(result, targets, names=names, conditions=conditions)
     put_assumed(result, conditions)
-    note = ABSOLUTE_NOTE.format(shlex.quote(str(path)))
+    note = ABSOLUTE_NOTE.format(quote_path(path))
     try:
         print_rows(POINT_COLUMNS, format_points, rows)
     except Exit:  # some rows are empty

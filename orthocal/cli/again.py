@@ -25,6 +25,7 @@ from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.files import exists
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 if TYPE_CHECKING:
@@ -65,7 +66,6 @@ def again(
     from orthocal.export.formats import note_wrong_order, require_entering
     from orthocal.export.linuxcnc.entered_lines import states_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
-    from orthocal.output.text.answer import quote_path
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
@@ -213,7 +213,6 @@ def _describe_conversion(
         path: Path of this calibration.
     """
     from orthocal.effects.compensation import compensates_alike
-    from orthocal.output.text.answer import quote_path
 
     if dict(new.adjusted) == dict(calibration.session.adjusted):
         return (

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, NamedTuple
 
@@ -38,6 +39,7 @@ from orthocal.io.files import (
     read_parts,
     write_file,
 )
+from orthocal.robot.model import name_coordinates
 from orthocal.text import comment_safe, shorten
 from orthocal.units import MM, UM, format_fixed
 
@@ -538,8 +540,7 @@ def _describe_controller(
     """Note about the offsets in the controller, [m, rad], when the program runs."""
     from orthocal.assessment.assess import assessment_of
 
-    drives = zip(result.robot.drives, values, strict=True)
-    listed = [f"{drive.name} {drive.show(value, '+z.3f')}" for drive, value in drives]
+    listed = name_coordinates(result.robot.drives, values, partial(format_fixed, sign=True))
     keep = assessment_of(result).keeps_offsets
     state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:

@@ -12,7 +12,7 @@ from orthocal.cli.options import Json, command, read_pairs
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
-from orthocal.text import printable
+from orthocal.text import printable, quote_path
 from orthocal.units import MM
 
 OF_TABLES = (
@@ -128,8 +128,6 @@ def _require_session(table: Path, session: Path) -> None:
     Raises:
         SessionError: Naming what is missing, or the order of exchanged arguments.
     """
-    from orthocal.output.text.answer import quote_path
-
     if exists(_session_file(session)):
         return
     if not exists(table):

@@ -34,6 +34,7 @@ from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import following_command, note_beyond_limits
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
+from orthocal.text import quote_path
 
 if TYPE_CHECKING:
     from orthocal.builder.build import EffectKeyValues
@@ -472,7 +473,7 @@ def _draw(
 def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.accuracy import describe_gains
-    from orthocal.output.text.answer import calibrate_command, quote_path
+    from orthocal.output.text.answer import calibrate_command
     from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import (
         describe_absent,
@@ -517,7 +518,6 @@ def _make_again(folder: Path) -> None:
     from orthocal.builder.build import remake_robot
     from orthocal.kinematics.reachable_box import describe_unreachable_box
     from orthocal.output.sheet.page import SHEET
-    from orthocal.output.text.answer import quote_path
 
     def check(robot: orthocal.Robot) -> None:
         box = robot.workspace

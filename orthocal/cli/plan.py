@@ -41,6 +41,7 @@ from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ParameterError
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
@@ -113,16 +114,20 @@ def plan(
     Args:
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
     """
-    from orthocal.output.text.answer import calibrate_command, quote_path
-    from orthocal.output.text.plan import describe_assumed_tip, plan_json
-    from orthocal.output.text.summary import print_summary
+    from orthocal.output.text.answer import calibrate_command
+    from orthocal.output.text.layout import print_rich
+    from orthocal.output.text.plan import describe_assumed_tip, plan_json, render_plan
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
     if out is not None:
         require_new_session(out, FILES, force=force)
     workers = options.workers or available_cores()
     chosen = _choose(subject, options, controller, workers=workers)
-    deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
+    deliver(
+        lambda: plan_json(chosen),
+        lambda: print_rich(render_plan(chosen, details=details)),
+        json=json,
+    )
     put_note(describe_assumed_tip(chosen.equipment, chosen.session))
     if out is not None:
         sessions = [Path(subject), out] if chosen.complements_session else [out]
@@ -190,8 +195,7 @@ def _missing_controller(session: orthocal.Session) -> str:
 
     drives, offsets = session.robot.drives, session.controller_offsets
     stated = {"offsets": offsets is not None, "backlash": bool(session.compensation)}
-    zeros = [0.0] * len(drives)
-    keys = [drive_keys(key, drives, zeros) for key, is_stated in stated.items() if not is_stated]
+    keys = [drive_keys(key, drives) for key, is_stated in stated.items() if not is_stated]
     if not keys:
         return ""
     head = "State what the controller corrects during the measurement, one number for each drive"

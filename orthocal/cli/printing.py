@@ -70,7 +70,7 @@ def deliver_judged(
     json: bool,
     out: Path | None = None,
     files: Callable[[], Mapping[str, Content]] = dict,
-    **shown: Any,  # noqa: ANN401 - arguments of `print_summary`
+    **shown: Any,  # noqa: ANN401 - arguments of `render_result`
 ) -> None:
     """Print a result with a decision about readings, and exit with its code.
 
@@ -80,14 +80,15 @@ def deliver_judged(
         typer.Exit: With the code of the decision if it is not 0.
     """
     from orthocal.calibration.assessment_record import Assessment
-    from orthocal.output.text.answer import print_decision
-    from orthocal.output.text.summary import assessment_in, print_summary, result_json
+    from orthocal.output.text.answer import render_decision
+    from orthocal.output.text.layout import print_rich
+    from orthocal.output.text.summary import assessment_in, render_result, result_json
 
     def show() -> None:
         if isinstance(result, Assessment):
-            print_decision(result, **shown)
+            print_rich(render_decision(result, **shown))
         else:
-            print_summary(result, **shown)
+            print_rich(render_result(result, **shown))
 
     deliver(lambda: result_json(result), show, json=json, out=out, files=files)
     if code := assessment_in(result).decision.exit_code:

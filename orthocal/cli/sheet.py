@@ -12,6 +12,7 @@ from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.io.files import is_folder, require_writable, write_files
+from orthocal.text import quote_path
 
 
 @command()
@@ -68,7 +69,7 @@ def following_command(plan: orthocal.Session, path: Path, directory: Path) -> st
         path: Path of its session.
         directory: Directory in which the command is typed.
     """
-    from orthocal.output.text.answer import calibrate_command, quote_path
+    from orthocal.output.text.answer import calibrate_command
 
     if plan.offsets_from is not None:
         entered = quote_path(os.path.relpath(plan.offsets_from, directory))

@@ -21,6 +21,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
+from orthocal.text import quote_path
 
 FILES = ("session.yaml", "readings.csv", "truth.yaml")
 
@@ -80,8 +81,6 @@ def simulate(
 
 def _report_drawn(drawn: Mapping[str, float], errors: Path, out: Path) -> None:
     """Print the errors of gauges that a file of errors does not state."""
-    from orthocal.output.text.answer import quote_path
-
     if drawn:
         values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
         put_note(

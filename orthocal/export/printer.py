@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from orthocal.assessment.wording import tool_mm
 from orthocal.calibration.calibration import Calibration
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.printers.settings import FirmwareName
+from orthocal.text import quote_path
 
 
 def export_printer(calibration: Calibration, firmware: FirmwareName) -> dict[str, str]:
@@ -88,7 +88,7 @@ def describe_next(fit: FirmwareFit, calibration: Path, out: Path) -> str:
     if not fit.worth_entering:
         return "Next: print. Nothing more has to be entered: these settings are hardly better."
     file = out / FIRMWARES[fit.settings.firmware].file
-    saved, again = (shlex.quote(str(p)) for p in (calibration, f"{out}-bed"))
+    saved, again = (quote_path(p) for p in (calibration, f"{out}-bed"))
     return (
         f"Next: enter the lines of {file}, home, probe again and judge the new log:\n"
         f"  orthocal import NEW_LOG {again}\n"

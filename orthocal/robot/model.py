@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copyreg
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +19,7 @@ from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
 from orthocal.robot.frames import Placement, find_frame, place_frames
 from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
-from orthocal.units import DRIVE_UNITS, InUnit, Unit
+from orthocal.units import DRIVE_UNITS, InUnit, Unit, format_fixed
 
 PARALLEL_SINE = 0.02
 """Sine of the largest angle between a slide and a leg that counts as parallel to it."""
@@ -568,18 +568,38 @@ def closure_turns(robot: Robot) -> Mask:
     return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
 
 
-def drive_keys(quantity: str, drives: Sequence[Drive], values: Sequence[float]) -> str:
+def drive_keys(
+    quantity: str, drives: Sequence[Drive], values: Sequence[float] | None = None
+) -> str:
     """Keys of a session with a value of each drive, such as "offsets_mm: [0, 0]", by their units.
 
     Args:
         quantity: First part of the keys: offsets or backlash.
         drives: The drives.
-        values: Value of each drive, [m, rad].
+        values: Value of each drive, [m, rad]; 0 by default.
     """
     texts: dict[str, list[str]] = {}
-    for drive, value in zip(drives, values, strict=True):
+    for drive, value in zip(drives, values or [0.0] * len(drives), strict=True):
         texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.6g}")
     return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
+
+
+def name_coordinates(
+    drives: Sequence[Drive],
+    values: Iterable[float],
+    show: Callable[[float], str] = format_fixed,
+) -> list[str]:
+    """Name of each drive with its coordinate and unit, such as "x 1.500 mm".
+
+    Args:
+        drives: The drives.
+        values: Coordinate of each drive, [m, rad].
+        show: Function that formats numbers in the units that users read.
+    """
+    return [
+        f"{drive.name} {show(float(value) / drive.joint_size)} {drive.joint_unit}"
+        for drive, value in zip(drives, values, strict=True)
+    ]
 
 
 def closure_row_units(robot: Robot) -> Array:

@@ -31,6 +31,12 @@ MAX_DIRECTIONS = 2
 _list = partial(list_some, most=MAX_LISTED)
 
 
+def square_root(covariance: Array) -> Array:
+    """Matrices R with R Rᵀ equal to covariances, which may be singular, shape (..., n, n)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
 class Information:
     """Identification Jacobian with gauge zeros eliminated, and its singular value decomposition.
 

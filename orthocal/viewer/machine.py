@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+from meshcat.transformations import translation_matrix
 
 from orthocal.arrays import Array
 from orthocal.robot.model import Robot
@@ -168,6 +169,5 @@ class MachineScene:
     def lower_ground(self, height: float) -> None:
         """Move the ground below a height, [m], if it is not below it."""
         self._ground[2] = min(self._ground[2], height)
-        pose = np.eye(4)
-        pose[:3, 3] = self._ground - [0.0, 0.0, 0.03 * self.size]
-        self.scene.place(GROUND, pose)
+        middle = self._ground - [0.0, 0.0, 0.03 * self.size]
+        self.scene.place(GROUND, translation_matrix(middle))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import meshcat.geometry as g
 import numpy as np
+from meshcat.transformations import translation_matrix
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.viewer.scene import Label, Scene
@@ -53,9 +54,9 @@ def cylinder(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
     return _AlongZ(height, radius, radius, start=start)
 
 
-def cone(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
-    """Cone along z whose base is at z = start, [m]."""
-    return _AlongZ(height, radius, 0.0, start=start)
+def cone(height: float, radius: float) -> g.Geometry:
+    """Cone along z whose base is at z = 0, [m]."""
+    return _AlongZ(height, radius, 0.0)
 
 
 def pose_along(origin: Array, direction: Array) -> Array:
@@ -106,31 +107,25 @@ def head_length(width: float) -> float:
     return 3.5 * width
 
 
-@dataclass(frozen=True, slots=True)
-class ArrowParts:
-    """Scales and position of the two parts of an arrow along z."""
-
-    shaft: tuple[float, float, float]
-    """Scale of a shaft of unit length."""
-    foot: float
-    """Coordinate of the start of the head, [m]."""
-    head: tuple[float, float, float]
-    """Scale of the head."""
-
-
-def arrow_parts(length: float, width: float) -> ArrowParts:
-    """Parts of an arrow; an arrow shorter than its head has a smaller head.
+def arrow_parts(lengths: ArrayLike, width: float) -> tuple[Array, Array, Array]:
+    """Parts of arrows along z; an arrow shorter than its head has a smaller head.
 
     Args:
-        length: Length, [m]; negative if the arrow points against z.
-        width: Diameter of the shaft, [m].
+        lengths: Lengths, shape (F,), [m]; negative if an arrow points against z.
+        width: Diameter of the shafts, [m].
+
+    Returns:
+        Scales of a shaft of unit length, starts of the heads, [m], and scales of the heads, each of
+        shape (F, 3).
     """
+    length = np.asarray(lengths, dtype=np.float64)
     # three.js needs scales that can be inverted
-    girth = max(min(1.0, abs(length) / head_length(width)), 1e-6)
-    head = math.copysign(girth, length)
+    girth = np.clip(np.abs(length) / head_length(width), 1e-6, 1.0)
+    head = np.copysign(girth, length)
     foot = length - head * head_length(width)
-    shaft = math.copysign(max(abs(foot), 1e-9), length)
-    return ArrowParts((girth, girth, shaft), foot, (girth, girth, head))
+    shaft = np.copysign(np.maximum(np.abs(foot), 1e-9), length)
+    feet = np.outer(foot, [0.0, 0.0, 1.0])
+    return np.column_stack([girth, girth, shaft]), feet, np.column_stack([girth, girth, head])
 
 
 def draw_arrow(
@@ -156,18 +151,15 @@ def draw_arrow(
     """
     look = material(colour)
     scene.place(path, pose)
-    parts = [arrow_parts(length, width) for length in lengths]
-    head = np.diag([*parts[0].head, 1.0])
-    head[2, 3] = parts[0].foot
-    shaft = np.diag([*parts[0].shaft, 1.0])
+    shafts, feet, heads = arrow_parts(lengths, width)
+    shaft = np.diag([*shafts[0], 1.0])
+    head = translation_matrix(feet[0]) @ np.diag([*heads[0], 1.0])
     scene.add(f"{path}/shaft", cylinder(1.0, width / 2.0), look, shaft)
     scene.add(f"{path}/head", cone(head_length(width), 1.3 * width), look, head)
-    if times is None:
-        return
-    feet = np.array([(0.0, 0.0, p.foot) for p in parts])
-    scene.track(f"{path}/shaft", "scale", "vector3", times, np.array([p.shaft for p in parts]))
-    scene.track(f"{path}/head", "position", "vector3", times, feet)
-    scene.track(f"{path}/head", "scale", "vector3", times, np.array([p.head for p in parts]))
+    if times is not None:
+        scene.track(f"{path}/shaft", "scale", "vector3", times, shafts)
+        scene.track(f"{path}/head", "position", "vector3", times, feet)
+        scene.track(f"{path}/head", "scale", "vector3", times, heads)
 
 
 def dial_distance(size: float) -> float:
@@ -211,7 +203,9 @@ def draw_gauge(
     if edge is not None:
         _draw_edge(scene, f"{path}/tip", axes.T @ edge, radius=ball or 0.0, height=stem)
     else:
-        scene.add(f"{path}/tip", g.Sphere(ball or stem), dark, _shift(0.0, 0.0, ball or 0.0))
+        scene.add(
+            f"{path}/tip", g.Sphere(ball or stem), dark, translation_matrix((0.0, 0.0, ball or 0.0))
+        )
     probe = 0.55 * stem if not ball else min(0.55 * stem, 0.7 * ball)
     above = ball or (stem if edge is not None else 0.0)
     scene.add(f"{path}/probe", cylinder(reach - size - above, probe, start=above), steel)
@@ -219,12 +213,12 @@ def draw_gauge(
     if not with_dial:
         return
     # from the axis of a cylinder, z, to the axis of the dial, y of the gauge
-    dial = _shift(0.0, 0.0, reach)
+    dial = translation_matrix((0.0, 0.0, reach))
     dial[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     thick = 0.45 * size
     scene.add(f"{path}/case", cylinder(thick, size, start=-thick / 2.0), dark, dial)
     scene.add(f"{path}/dial", cylinder(0.04 * size, 0.86 * size, start=thick / 2.0), white, dial)
-    hand = _shift(0.0, thick / 2.0 + 0.06 * size, reach + 0.3 * size)
+    hand = translation_matrix((0.0, thick / 2.0 + 0.06 * size, reach + 0.3 * size))
     scene.add(f"{path}/needle", g.Box([0.09 * size, 0.04 * size, 0.75 * size]), dark, hand)
 
 
@@ -244,19 +238,12 @@ def draw_bar(scene: Scene, path: str, fixed: Array, ball: Array, size: float) ->
     """
     steel, dark = material((0.75, 0.76, 0.8), shiny=True), material((0.16, 0.17, 0.2), shiny=True)
     length = float(np.linalg.norm(ball - fixed))
-    foot = _shift(*to_triple(fixed))
+    foot = translation_matrix(fixed)
     scene.add(f"{path}/post", cylinder(3.0 * size, 0.5 * size, start=-3.0 * size), dark, foot)
     scene.add(f"{path}/fixed", g.Sphere(size), steel, foot)
     scene.add(f"{path}/{BAR}/rod", cylinder(length, 0.35 * size), dark)
-    scene.add(f"{path}/{BAR}/ball", g.Sphere(size), steel, _shift(0.0, 0.0, length))
+    scene.add(f"{path}/{BAR}/ball", g.Sphere(size), steel, translation_matrix((0.0, 0.0, length)))
     scene.place(f"{path}/{BAR}", pose_along(fixed, (ball - fixed) / max(length, 1e-9)))
-
-
-def _shift(x: float, y: float, z: float) -> Array:
-    """Pose of a pure translation, shape (4, 4), [m]."""
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose
 
 
 def _draw_edge(scene: Scene, path: str, edge: Array, *, radius: float, height: float) -> None:
@@ -289,7 +276,9 @@ def draw_ground(scene: Scene, path: str, *, side: float, pitch: float) -> None:
     points = np.zeros((8 * count + 4, 3), dtype=np.float32)
     points[:, :2] = np.concatenate(ends).reshape(-1, 2)
     plate = g.Box([2.0 * half, 2.0 * half, 0.002])
-    scene.add(f"{path}/plate", plate, material((0.93, 0.94, 0.95)), _shift(0.0, 0.0, -0.002))
+    scene.add(
+        f"{path}/plate", plate, material((0.93, 0.94, 0.95)), translation_matrix((0.0, 0.0, -0.002))
+    )
     lines = g.LineSegments(g.PointsGeometry(points.T), g.LineBasicMaterial(color=0xB8BEC6))
     scene.visualizer[f"/{path}/lines"].set_object(lines)
 

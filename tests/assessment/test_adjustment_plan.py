@@ -147,7 +147,8 @@ def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
     search.max_amounts = np.full(15, 1.0)
     chosen = search.choose()[:2]
     stated = search.uncertainties(chosen) / 2.0
-    root = np.linalg.cholesky(search._covariance() + 1e-24 * np.eye(len(search._covariance())))
+    covariance = calibration.error_covariances[0]
+    root = np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance)))
     rng = np.random.default_rng(3)
     n = root.shape[0]
     field = search._without_offsets(search.tool.jacobian[:, :, :n])

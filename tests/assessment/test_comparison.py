@@ -15,7 +15,6 @@ from orthocal import calibrate, summarize
 from orthocal.assessment.comparison import compare_models, find_known_noises
 from orthocal.assessment.recommendation import (
     STRONG,
-    ModelEvidence,
     Recommendation,
     recommend_model,
 )
@@ -53,7 +52,7 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     assert table1.best is table1["full"]
     assert [r.model for r in table1] == ["offsets", "lengths", "full"]
     assert "full" in table1
-    assert (table1["offsets"].redundancy, table1["full"].redundancy) == (3, 0)
+    assert [table1[m].calibration.redundancy for m in ("offsets", "full")] == [3, 0]
     found = table1.assessment
     assert (found.decision.verdict, found.decision.exit_code) == ("enter", 0)
     (recommended,) = found.of_kind("recommended")
@@ -321,7 +320,7 @@ def test_linearised_and_exact_predictions_nearly_agree(cycles):
 def test_repeated_readings_are_not_counted_as_new_ones(cycles):
     """Six setups in three postures, three times over: twelve differences, whatever the cycles."""
     assert cycles.independent == 12
-    assert cycles["full"].redundancy == 0
+    assert cycles["full"].calibration.redundancy == 0
     # the cycles scatter by 10.2 µm, less than the 10.4 µm that the gauge states with its rounding
     assert {n.source for n in cycles.noises.values()} == {"gauge"}
     assert cycles.recommendation.model == "offsets"
@@ -334,7 +333,7 @@ def test_undetermined_offsets_have_their_tolerances_as_prior(raw_cycles):
     session = replace(raw_cycles, readings=rows)
     found = compare_models(session, models=["offsets"], options=QUICK, judgement=SOUND)
     (result,) = found.results
-    assert (result.prior, result.by_choice, result.redundancy) == (True, False, 0)
+    assert (result.prior, result.calibration.redundancy) == (True, 0)
     json.loads(found.to_json())
 
 
@@ -367,7 +366,7 @@ def test_an_undetermined_offset_has_a_prior_in_all_models(raw_cycles):
     session, models = replace(raw_cycles, readings=rows), ["offsets", "lengths"]
     found = compare_models(session, models=models, options=QUICK, judgement=SOUND)
     assert found.undetermined == ()
-    assert {r.model: r.by_choice for r in found.results} == {"offsets": False, "lengths": True}
+    assert [(r.model, r.prior) for r in found.results] == [("offsets", True), ("lengths", True)]
 
 
 def test_the_recommendation_is_first_and_models_without_redundancy_have_no_criteria(table1):
@@ -403,7 +402,7 @@ def test_readings_without_deviation_support_offsets_and_small_tolerances(raw_cyc
 
 def test_one_tolerance_scale_is_stated():
     """The calibration applies that of the judgement."""
-    recommendation = Recommendation("full", 2.2, (ModelEvidence("full", 0.0),), 9.0)
+    recommendation = Recommendation("full", 2.2, {"full": 0.0}, 9.0)
     kinds = {
         scale: [f.kind for f in describe_recommendation(recommendation, judged_scale=scale)]
         for scale in (1.0, 3.0)

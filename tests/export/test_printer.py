@@ -127,7 +127,7 @@ def test_no_nearby_settings_are_better(calibrated):
     fit = fit_firmware(calibration, "klipper")
     targets, _ = _find_targets(calibration, "bed")
     closure = LoopClosure(calibration.robot, fixed=calibration.errors)
-    real = closure.forward(targets.layer_carriages)
+    real = closure.forward(targets.layer.carriages)
     value = {p.name: p.value for p in calibration.sensors}
     roll, yaw = (value[f"setup.bed.{k}"] for k in ("roll", "yaw"))
     normal = np.array([np.cos(roll) * np.sin(yaw), -np.sin(roll), np.cos(roll) * np.cos(yaw)])
@@ -135,16 +135,16 @@ def test_no_nearby_settings_are_better(calibrated):
 
     def cost(settings):
         change = np.array(settings.homed) - calibration.session.firmware.homed
-        believed = settings.forward(targets.carriages + change)
-        off = believed - targets.points
-        arms = np.column_stack([-targets.points[:, 1], targets.points[:, 0]])
+        believed = settings.forward(targets.space.carriages + change)
+        off = believed - targets.space.points
+        arms = np.column_stack([-targets.space.points[:, 1], targets.space.points[:, 0]])
         basis = np.zeros((len(off), 3, 3))
         basis[:, 0, 0] = basis[:, 1, 1] = 1.0
         basis[:, :2, 2] = arms
         root = np.sqrt(np.repeat(targets.weights, 3))
         a, b = root[:, None] * basis.reshape(-1, 3), root * off.ravel()
         rest = b - a @ np.linalg.lstsq(a, b, rcond=None)[0]
-        heights = settings.forward(targets.layer_carriages + change)[:, 2]
+        heights = settings.forward(targets.layer.carriages + change)[:, 2]
         return rest @ rest + 10.0 * np.mean(heights**2), np.sqrt(rest @ rest)
 
     best, rms = cost(fit.settings)

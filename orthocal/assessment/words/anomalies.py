@@ -10,6 +10,7 @@ from orthocal.assessment.wording import (
     joined,
     mm,
     name_offsets,
+    named,
     note,
     plain,
     review,
@@ -168,7 +169,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
     where, action = "", "Measure again."
     if result.suspected:
         names = list(dict.fromkeys(session.readings[i].setup for i in result.suspected))
-        setups = f"setup{'s' * (len(names) > 1)} {joined(names)}"
+        setups = named("setup", names)
         lines = _lines(session, suspected).removesuffix(": ")
         where = f", most likely in {f'{lines} ({setups})' if lines else setups}"
         action = advise_repetition(session, suspected)
@@ -365,7 +366,7 @@ def _subject(session: Session, e: Explanation) -> str:
         return f"all readings of {e.scope} {e.names[0]}"
     if e.scope == "session":
         return "all readings"
-    return f"{'setup' if len(e.setups) == 1 else 'setups'} {joined(e.setups)}"
+    return named("setup", e.setups)
 
 
 def _text(session: Session, e: Explanation) -> str:
@@ -396,7 +397,7 @@ def _text(session: Session, e: Explanation) -> str:
         "displaced gauge": lambda: _displaced(session, e),
         "displaced artefact": lambda: _displaced_artefact(session, e),
         "wrong dimension": lambda: _other_dimension(session, e),
-        "readjusted dimension": lambda: _readjusted(session, e),
+        "readjusted dimension": lambda: _other_dimension(session, e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
             f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
@@ -522,20 +523,15 @@ def _dimensions_mm(e: Explanation) -> tuple[float, float]:
 
 
 def _other_dimension(session: Session, e: Explanation) -> str:
-    """Clause about a wrong dimension with its true and stated size."""
+    """Clause about a wrong or readjusted dimension with its true and stated size."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
+    where, there = f" in {_subject(session, e)} is", ""
+    if e.kind == "readjusted dimension":
+        since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
+        where, there = f" was changed{since}: it is", " there"
     zeroed = f", or the dial was not zeroed at {stated:g} mm" * has_known_zero(session, e)
-    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm{zeroed}"
-
-
-def _readjusted(session: Session, e: Explanation) -> str:
-    """A dimension that differs from a session on, with both sizes."""
-    true, stated = _dimensions_mm(e)
-    what = e.names[0].rpartition(".")[2].removesuffix("_mm")
-    since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
-    zeroed = f", or the dial was not zeroed at {stated:g} mm" * has_known_zero(session, e)
-    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm{zeroed}"
+    return f"the {what}{where} {plain(true)} mm{there}, not {stated:g} mm{zeroed}"
 
 
 def _swapped(session: Session, e: Explanation) -> str:
@@ -563,7 +559,7 @@ def _changed(session: Session, e: Explanation) -> str:
     verb = "moved" if e.drives else "changed"
     when = f"before session {e.sessions[0]}"
     if e.apart:
-        when = f"for session{'s' * (len(e.sessions) > 1)} {joined(e.sessions)} only"
+        when = f"for {named('session', e.sessions)} only"
     return f"the machine changed: {what} {verb}{_amount_of_change(session, e)} {when}"
 
 

@@ -195,7 +195,7 @@ def compensation_not_stated(
         effects: Names of the identified effects that a controller compensates.
         drives: The drives.
     """
-    zeros = drive_keys("backlash", drives, [0.0] * len(drives))
+    zeros = drive_keys("backlash", drives)
     compensated = joined([COMPENSATED[effect] for effect in effects])
     which = "The session does"
     if all(sessions):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from orthocal.assessment.wording import (
     joined,
+    named,
     note,
     parameter_places,
     reject,
@@ -353,10 +354,10 @@ def exchanged_sides(
         places: Places of their readings.
     """
     where = f" ({spans(sorted(lines), 'line')})" if lines else ""
-    noun, these = ("setup", "this setup") if len(setups) == 1 else ("setups", "these setups")
+    these = "this setup" if len(setups) == 1 else "these setups"
     return review(
         "sides exchanged",
-        f"In {noun} {joined(setups)}{where} the effect of the backlash has the opposite sign: the "
+        f"In {named('setup', setups)}{where} the effect of the backlash has the opposite sign: the "
         "sides of approach seem to be exchanged.",
         "Check the column `approach`: p if the coordinate of a drive grew in its last motion, n if "
         "it fell; a joint that counts down displays the opposite. Correct it, or read "
@@ -392,7 +393,7 @@ def differing_closings(
     return review(
         "differing closing reading",
         f"The closing reading differs from the first one by more than {usual / MM:.2g} mm in "
-        f"{noun} {joined(described)}. The gauge or the machine was displaced, or a reading is "
+        f"{named('setup', described)}. The gauge or the machine was displaced, or a reading is "
         "wrong.",
         f"Check both readings. If they are right, {remedy}.",
         places,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined
+from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined, named
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.session.session import Reading, Session, split_label
-from orthocal.text import printable, spans, uncapitalised
+from orthocal.text import quote_path, spans, uncapitalised
 from orthocal.units import DRIVE_UNITS, MM
 
 
@@ -88,7 +87,7 @@ def advise_repetition(session: Session, *explanations: Explanation) -> str:
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:
         return f"Read {what} again, or leave out what is wrong."
-    line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
+    line, path = rows[0].line, quote_path(file.parent)
     others = ""
     if further := {r.line or 0 for r in rows} - {line}:
         one_file = len({r.file for r in rows}) == 1
@@ -126,8 +125,7 @@ def command_to_restart(session: Session, reading: Reading) -> str:
     file = reading.file or session.readings_path
     if file is None or reading.line is None or not _has_present_offsets(session, reading):
         return ""
-    path = printable(shlex.quote(str(file.parent)))
-    return f"in `orthocal record {path}` type `restart {reading.line}`"
+    return f"in `orthocal record {quote_path(file.parent)}` type `restart {reading.line}`"
 
 
 def advise_factor(explanations: Sequence[Explanation]) -> str:
@@ -207,13 +205,12 @@ def _calibrate_present(session: Session, e: Explanation) -> str:
     """Clause with the command that calibrates the sessions since a change without earlier ones."""
     names = list(dict.fromkeys(session.labels))
     present = e.sessions if e.apart else names[names.index(e.sessions[0]) :]
-    which = f"session{'s' * (len(present) > 1)} {joined(present)}"
-    clause = f"calibrate {which} without the others"
+    clause = f"calibrate {named('session', present)} without the others"
     paths = [part.path for part in session.parts]
     if len(paths) != len(names) or None in paths:
         return clause
     directories = [
-        printable(shlex.quote(str(path.parent)))
+        quote_path(path.parent)
         for name, path in zip(names, paths, strict=True)
         if name in present and path is not None
     ]

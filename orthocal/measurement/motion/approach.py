@@ -22,6 +22,15 @@ from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
+AS_ARROWS_SHOW = (
+    "Approach each posture as its arrows show: in the last {} the displayed number of the joint "
+    "grows (↑) or falls (↓)."
+)
+"""Rule for readings with stated approaches; {} is the length of the approach."""
+
+FROM_ONE_SIDE = "Approach every posture from the same side: the last {} in one direction."
+"""Rule for readings without stated approaches; {} is the length of the approach."""
+
 USUAL_LENGTH = 2e-3
 """Usual length of the approach of a prismatic drive, [m]."""
 

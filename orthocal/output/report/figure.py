@@ -24,7 +24,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthocal.arrays import Array
 
 WIDTH = 7.2
 """Width of a figure, [inch]; 100 pixels per inch on the page."""

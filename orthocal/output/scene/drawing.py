@@ -30,10 +30,10 @@ from orthocal.output.scene.deviations import (
 from orthocal.output.scene.readings import draw_readings, write_headline, write_steps
 from orthocal.output.scene.tool_errors import draw_tool_errors
 from orthocal.output.text.layout import counted, typeset
-from orthocal.robot.model import Robot, coordinate_units
+from orthocal.robot.model import Robot, coordinate_units, name_coordinates
 from orthocal.robot.reference_posture import count_free_motions
 from orthocal.session.session import Session
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import MM
 from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.motion import (
     Timeline,
@@ -156,12 +156,9 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
 
 def _state_zero(robot: Robot) -> list[str]:
     """Facts about the mechanical zero in joint coordinates, and about free motions."""
-    drives = ", ".join(
-        f"{d.name} {float(d.to_joint(d.zero)) / size + 0.0:.6g} {unit}"
-        for d in robot.drives
-        for unit, size in [DRIVE_UNITS[d.unit]]
-    )
-    facts = [f"Mechanical zero: {drives}."]
+    zero = [float(d.to_joint(d.zero)) for d in robot.drives]
+    drives = name_coordinates(robot.drives, zero, lambda v: f"{v + 0.0:.6g}")
+    facts = [f"Mechanical zero: {', '.join(drives)}."]
     computed = [d.name for d in robot.drives if d.zero_computed]
     if computed:
         facts.append(f"Computed by closing the loops: the zero of {', '.join(computed)}.")

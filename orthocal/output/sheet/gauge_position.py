@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,8 +93,7 @@ def find_gauge_position(
     names, contact = guidance.contacts[motion.setup]
     alignment = session.alignment_postures[motion.setup]
     aligned = names.index(alignment)
-    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    q = np.array([guidance.passive[n] for n in names])
+    drives, q = _coordinates(session, guidance, names)
     rods = [] if leg is None else list(leg.rods.values())
     ends = [frame for r in rods for frame in (r.root, r.tip)]
     ends += [] if leg is None else [leg.root, leg.tip]
@@ -134,10 +133,16 @@ def hinge_distances(session: Session, setup: str, guidance: Guidance) -> dict[st
     if rod is None:
         return {}
     names, contact = guidance.contacts[setup]
-    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    q = np.array([guidance.passive[n] for n in names])
-    distances, _, _ = _locate_on_rod(session.robot, rod, drives, q, contact)
+    distances, _, _ = _locate_on_rod(
+        session.robot, rod, *_coordinates(session, guidance, names), contact
+    )
     return dict(zip(names, distances.tolist(), strict=True))
+
+
+def _coordinates(session: Session, guidance: Guidance, names: Sequence[str]) -> tuple[Array, Array]:
+    """Drive and passive coordinates of the nominal machine in postures, [m, rad]."""
+    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
+    return drives, np.array([guidance.passive[n] for n in names])
 
 
 def _locate_on_rod(

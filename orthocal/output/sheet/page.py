@@ -13,7 +13,7 @@ from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, name_direction
 from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.motion.approach import approach_length, describe_approach
+from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length, describe_approach
 from orthocal.measurement.motion.motion import (
     SetupMotion,
     Stop,
@@ -33,7 +33,7 @@ from orthocal.output.sheet.gauge_position import (
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
-from orthocal.robot.model import PARALLEL_SINE, Robot, drive_keys
+from orthocal.robot.model import PARALLEL_SINE, Robot, drive_keys, name_coordinates
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
 from orthocal.sensors.protocol import has_dial, mounting_steps, tool_path
@@ -135,10 +135,9 @@ def _front(
     """The first page: checks of the machine, rules, and the list of setups."""
     robot = session.robot
     stops = [s for m in motions for s in m.stops if s.role == "reading"]
-    lead = (
-        f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}. "
-        f"Gauge: {_gauges(session)}."
-    )
+    gauges = "; ".join(_gauge(name, gauge) for name, gauge in session.gauges.items())
+    count = f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}"
+    lead = f"{count}. Gauge: {gauges}."
     several = len(session.gauges_with_readings) > 1
     headers = (
         *("", "setup", "measures", *(["gauge"] if several else []), "readings"),
@@ -169,6 +168,7 @@ def _front(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
         for text in ("Date, name", *_asked_once(session))
     )
+    with_bar = any(isinstance(s.sensor, BallBar) for s in session.setups.values())
     return (
         f"<header>{heading('Measuring sheet', level=1)}"
         f"{paragraph(f'{robot.name}: {session.title}' if session.title else robot.name)}"
@@ -179,7 +179,7 @@ def _front(
         + _numbered(_reading_rules(session, motions))
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3 + several)
-        + (_programs(options, with_bar=_has_bar(session)) if with_programs else "")
+        + (_programs(options, with_bar=with_bar) if with_programs else "")
     )
 
 
@@ -197,10 +197,6 @@ def _largest_difference(robot: Robot) -> str:
         limit = math.ceil((LIMIT * offset.prior_std + by_eye) / size)
         largest[unit] = max(largest.get(unit, 0), limit)
     return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
-
-
-def _has_bar(session: Session) -> bool:
-    return any(isinstance(s.sensor, BallBar) for s in session.setups.values())
 
 
 def _programs(options: ProgramOptions | None, *, with_bar: bool) -> str:
@@ -456,11 +452,6 @@ def _numbered(texts: list[str]) -> str:
     return "<ol>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ol>"
 
 
-def _gauges(session: Session) -> str:
-    """Name, range and resolution of the gauges."""
-    return "; ".join(_gauge(name, gauge) for name, gauge in session.gauges.items())
-
-
 def _gauge(name: str, gauge: Gauge) -> str:
     """Name, range and resolution of a gauge."""
     parts = [name] if name else []
@@ -476,7 +467,7 @@ def _active_offsets(session: Session) -> str:
     """The offsets that must be active in the controller."""
     drives = session.robot.drives
     if session.controller_offsets is None:
-        keys = drive_keys("offsets", drives, [0.0] * len(drives))
+        keys = drive_keys("offsets", drives)
         return (
             "session.yaml does not state the offsets of the controller. Before the first "
             f"calibration write `controller: {{{keys}}}` into it, afterwards the offsets that you "
@@ -488,10 +479,7 @@ def _active_offsets(session: Session) -> str:
             "has, state them there (`controller`). Do not change the controller's zeros until all "
             "readings are taken."
         )
-    active = ", ".join(
-        f"{d.name} {_number(v / DRIVE_UNITS[d.unit][1], 3)} {DRIVE_UNITS[d.unit][0]}"
-        for d, v in zip(drives, session.active_offsets, strict=True)
-    )
+    active = ", ".join(name_coordinates(drives, session.active_offsets, _number))
     return (
         f"Check that these offsets of a calibration are entered, as session.yaml states: {active}. "
         f"{OFFSETS_IN_LINUXCNC} Do not change them until all readings are taken."
@@ -517,7 +505,7 @@ def _compensation(session: Session) -> str:
         "session.yaml does not state which backlash the controller compensates (LinuxCNC: "
         "BACKLASH, COMP_FILE). Write it into session.yaml, 0 for none, in the order "
         f"{', '.join(d.name for d in session.robot.drives)}: controller: "
-        f"{{{drive_keys('backlash', session.robot.drives, [0.0] * len(session.robot.drives))}}}."
+        f"{{{drive_keys('backlash', session.robot.drives)}}}."
     )
 
 
@@ -591,11 +579,10 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
     if len(arrows) > 1:
         return (
-            f"Approach each posture as its arrows show: in the last {length} the displayed number "
-            f"of the joint grows (↑) or falls (↓).{_order_of_arrows(robot, arrows)} The programs "
-            f"do this. If you jog, first move each joint to a number {length} smaller (↑) or "
-            "larger (↓) than that of the posture. Then move all joints to the posture in one "
-            "motion. If a joint went too far, begin the approach again."
+            f"{AS_ARROWS_SHOW.format(length)}{_order_of_arrows(robot, arrows)} The programs do "
+            f"this. If you jog, first move each joint to a number {length} smaller (↑) or larger "
+            "(↓) than that of the posture. Then move all joints to the posture in one motion. If a "
+            "joint went too far, begin the approach again."
         )
     (arrow,) = arrows
     return (
@@ -639,21 +626,18 @@ def _travel(session: Session) -> list[str]:
 
 def _joint_list(robot: Robot, drives: Array) -> str:
     """Every joint with its number in the controller."""
-    return ", ".join(
-        f"{d.name} {text} {DRIVE_UNITS[d.unit][0]}"
-        for d, text in zip(robot.drives, _joint_values(robot, drives), strict=True)
-    )
+    return ", ".join(name_coordinates(robot.drives, shown_joints(robot, drives), _number))
 
 
 def _joint_values(robot: Robot, drives: Array) -> list[str]:
     """Numbers that the controller shows for its joints."""
     return [
-        _number(float(v) / DRIVE_UNITS[d.unit][1], 3)
+        _number(float(v) / DRIVE_UNITS[d.unit][1])
         for d, v in zip(robot.drives, shown_joints(robot, drives), strict=True)
     ]
 
 
-def _number(value: float, decimals: int, *, sign: bool = False) -> str:
+def _number(value: float, decimals: int = 3, *, sign: bool = False) -> str:
     """A number with a true minus and no negative zero."""
     return true_minus(format_fixed(value, decimals, sign=sign))
 

@@ -20,10 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 from orthocal.arrays import Array
 from orthocal.assessment.wording import axis_name, name_direction
 from orthocal.io.html import escape
-from orthocal.output.sheet.gauge_position import (
-    ABOUT_ALONG,
-    GaugePosition,
-)
+from orthocal.output.sheet.gauge_position import ABOUT_ALONG, GaugePosition
 from orthocal.output.text.layout import short_name
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import has_dial
@@ -125,9 +122,7 @@ class Picture:
     _drawn: list[Array] = field(default_factory=list)
     """Points of what labels should not cover, a point about every millimetre, shape (n, 2)."""
 
-    def polygon(
-        self, points: Array, *, fill: str, stroke: str = "#555", width: float = 0.2
-    ) -> None:
+    def polygon(self, points: Array, *, fill: str, stroke: str, width: float = 0.2) -> None:
         """A closed outline that labels may cover, points of shape (n, 2)."""
         self.parts.append(
             f'<polygon points="{_pairs(points)}" fill="{fill}" stroke="{stroke}" '
@@ -321,9 +316,9 @@ def outline(points: Array) -> Array:
     return np.asarray(points[corners])
 
 
-def circle_points(count: int = 24) -> Array:
-    """Points of the unit circle, shape (count, 2)."""
-    angles = np.arange(count) * 2.0 * math.pi / count
+def circle_points() -> Array:
+    """24 points of the unit circle, shape (24, 2)."""
+    angles = np.arange(24) * 2.0 * math.pi / 24
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
@@ -380,12 +375,7 @@ def draw_machine(robot: Robot, visuals: Sequence[Visual], gauge: GaugePosition) 
     if len(surface):
         picture.polygon(view.project(surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
     _draw_tool_path(picture, view, gauge)
-    foot = view.project(gauge.point)
-    if gauge.contact.fixed is None:
-        _draw_dial(picture, view, gauge, foot, view.project(dial), radius=5.0)
-    else:
-        _draw_bar(picture, foot, view.project(dial))
-    picture.circle(foot, 1.1, fill=BLACK, stroke="#fff")
+    _draw_sensor(picture, view, gauge, dial)
     _draw_axes(picture, view, np.array([14.0, 18.0]))
     _label_leg(picture, view, gauge)
     return picture.to_svg(f"Setup {gauge.setup.name}: the gauge on the machine")
@@ -397,6 +387,16 @@ def _gauge_end(gauge: GaugePosition, reach: float) -> Array:
     if contact.fixed is not None:
         return contact.fixed
     return np.asarray(gauge.point + (-reach if contact.at_tool else reach) * contact.direction)
+
+
+def _draw_sensor(picture: Picture, view: _View, gauge: GaugePosition, end: Array) -> None:
+    """A dial or a bar up to its end, shape (3,), [m], and its contact in the alignment posture."""
+    foot, far = view.project(gauge.point), view.project(end)
+    if gauge.contact.fixed is None:
+        _draw_dial(picture, view, gauge, foot, far, radius=5.0)
+    else:
+        _draw_bar(picture, foot, far)
+    picture.circle(foot, 1.1, fill=BLACK, stroke="#fff")
 
 
 def _draw_bar(picture: Picture, ball: Array, fixed: Array) -> None:
@@ -549,15 +549,9 @@ def draw_tool(gauge: GaugePosition) -> str:
     picture = Picture(*SECTION_SIZE)
     if contact.surface is not None:
         picture.polygon(view.project(contact.surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
-    places = view.project(contact.points)
-    for place in places:
+    for place in view.project(contact.points):
         picture.circle(place, 0.9, fill=GREEN, stroke="#fff")
-    foot = places[gauge.aligned]
-    if contact.fixed is None:
-        _draw_dial(picture, view, gauge, foot, view.project(end), radius=5.0)
-    else:
-        _draw_bar(picture, foot, view.project(end))
-    picture.circle(foot, 1.1, fill=BLACK, stroke="#fff")
+    _draw_sensor(picture, view, gauge, end)
     _draw_axes(picture, view, _free_corner(view.project(around)))
     return picture.to_svg(f"Setup {gauge.setup.name}: the places of its readings")
 

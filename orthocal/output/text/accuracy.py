@@ -33,7 +33,7 @@ from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.estimation.selection import complete_model, select_parameters
 from orthocal.io.documents import format_json
 from orthocal.output.text.conditions import describe_conditions_of
-from orthocal.output.text.layout import noted, print_rich, table_of, um
+from orthocal.output.text.layout import noted, table_of, um
 from orthocal.units import MM, UM, read_limit
 
 if TYPE_CHECKING:
@@ -95,11 +95,6 @@ def render_tool(calibration: Calibration, further: FurtherHour) -> RenderableTyp
         return render_accuracy(calibration, assess_tool(calibration), further)
     except (ClosureError, RobotError) as e:
         return Text(f"The tool error cannot be computed: {e}.")
-
-
-def print_accuracy(calibration: Calibration, accuracy: ToolAccuracy, further: FurtherHour) -> None:
-    """Print the tool errors over a region."""
-    print_rich(render_accuracy(calibration, accuracy, further))
 
 
 def render_accuracy(

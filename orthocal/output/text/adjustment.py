@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Group, RenderableType
-from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.adjustment_plan import AdjustmentPlan, plan_adjustments
@@ -22,8 +21,9 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError
 from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
-from orthocal.output.text.answer import quote_path, render_next
-from orthocal.output.text.layout import bullets, plain, print_rich, signed, table_of
+from orthocal.output.text.answer import render_next
+from orthocal.output.text.layout import bullets, indented, plain, print_rich, signed, table_of
+from orthocal.text import quote_path
 from orthocal.units import MM
 
 SCHEMA = "orthocal/adjustment/1"
@@ -85,7 +85,7 @@ def render_plan(
             for i, p in enumerate(plan.adjustments, start=1)
         ]
         headers = ("", "adjustment", "set", "amount", "±", "tool error")
-        parts += [Padding(table_of(headers, rows, left=3), (0, 0, 0, 2)), Text()]
+        parts += [indented(table_of(headers, rows, left=3)), Text()]
         notes = [
             "Amount, ± and tool error are in mm. The tool error is that after this adjustment and "
             "those before it, with the offsets entered again.",

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Group, RenderableType
-from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -35,17 +33,18 @@ from orthocal.output.text.layout import (
     EXPANDED,
     bullets,
     counted,
+    indented,
     list_places,
     noted,
     plain,
-    print_rich,
     section,
     short_name,
     signed,
     table_of,
+    table_of_records,
 )
 from orthocal.session.session import split_label
-from orthocal.text import printable
+from orthocal.text import quote_path
 from orthocal.units import DRIVE_UNITS, show_limit, tidy
 
 UNCHANGED = "unchanged"
@@ -122,14 +121,12 @@ def render_answer(
 def _values(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
     """Values to enter, with notes."""
     parts: list[RenderableType] = []
+    unstated = [f.words for f in assessment.of_kind("controller not stated")]
     if assessment.entries:
-        parts += [
-            _indented(entry_table(calibration)),
-            *(_indented(Text(text)) for text in _entry_notes(calibration, assessment)),
-            Text(),
-        ]
+        notes = unstated or describe_columns(calibration)
+        parts += [indented(entry_table(calibration)), *(indented(Text(t)) for t in notes), Text()]
     if assessment.backlash:
-        parts += [_indented(render_backlash(calibration)), Text()]
+        parts += [indented(render_backlash(calibration)), Text()]
     return parts
 
 
@@ -168,22 +165,11 @@ def _describe(finding: Finding, decision: Decision) -> str:
     return finding.text if finding.action[1:] in decision.action else finding.words
 
 
-def print_decision(assessment: Assessment, *, details: bool = False) -> None:
-    """Print a decision about readings: in colour on a terminal."""
-    print_rich(render_decision(assessment, details=details))
-
-
 def render_headline(decision: Decision) -> Text:
     """Headline of a decision, and its reason."""
     doubtful = decision.verdict == "enter" and decision.exit_code  # not confirmed
     headline = (decision.headline, STYLES["review" if doubtful else decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
-
-
-def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[str]:
-    """Notes on entering the values."""
-    unstated = assessment.of_kind("controller not stated")
-    return [unstated[0].words] if unstated else describe_columns(calibration)
 
 
 def describe_columns(calibration: Calibration) -> list[str]:
@@ -344,15 +330,6 @@ def _repeat_choice(calibration: Calibration) -> list[str]:
     return options
 
 
-def quote_path(path: str | Path) -> str:
-    """A path or another word as it can be typed in a shell."""
-    return printable(shlex.quote(str(path)))
-
-
-def _indented(part: RenderableType) -> RenderableType:
-    return Padding(part, (0, 0, 0, 2))
-
-
 def render_subject(calibration: Calibration) -> RenderableType:
     """Machine and readings of a calibration, in four lines."""
     title = short_name(calibration.session.title, LONGEST_LINE)
@@ -500,18 +477,19 @@ def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
     """
     assessment = assessment_of(calibration)
     keep = assessment.keeps_offsets
-    stated = any(e.active is not None for e in assessment.entries)
-    columns = ["now", "best" if keep else "new"] if stated else ["best" if keep else "add"]
     directions = {d.name: d.direction for d in calibration.robot.drives}
     counts_down = not keep and any(directions[e.drive] < 0 for e in assessment.entries)
     rows = []
     for e in assessment.entries:
-        factor = e.edge_factor
-        now = [] if e.active is None else [signed(e.active * factor)]
-        joint = [signed(directions[e.drive] * e.change * factor)] if counts_down else []
-        estimate = [signed(e.identified * factor)] if identified else []
-        half = e.held or plain(expanded_uncertainty(calibration, e) * factor)
-        rows.append((e.drive, *now, signed(e.best * factor), half, *joint, *estimate, e.edge_unit))
-    further = [*(["joint"] if counts_down else []), *(["identified"] if identified else [])]
-    headers = ("drive", *columns, "±", *further, "unit")
-    return table_of(headers, rows)
+        factor, best = e.edge_factor, "add"
+        row = {"drive": e.drive}
+        if e.active is not None:
+            row["now"], best = signed(e.active * factor), "new"
+        row["best" if keep else best] = signed(e.best * factor)
+        row["±"] = e.held or plain(expanded_uncertainty(calibration, e) * factor)
+        if counts_down:
+            row["joint"] = signed(directions[e.drive] * e.change * factor)
+        if identified:
+            row["identified"] = signed(e.identified * factor)
+        rows.append(row | {"unit": e.edge_unit})
+    return table_of_records(rows)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Group, RenderableType
-from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.comparison import Comparison
@@ -17,11 +16,11 @@ from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import STYLES, render_decision
 from orthocal.output.text.layout import (
     EXPANDED,
-    MANY_ROWS,
     NOISE_SOURCES,
-    WORST_ROWS,
     bullets,
+    choose_worst,
     counted,
+    indented,
     mm,
     noted,
     plain,
@@ -58,7 +57,7 @@ def render_comparison(
             Text(assessed.decision.headline, style=STYLES[assessed.decision.verdict]),
             Text(recommended[0].text),
             Text(),
-            Padding(_tool_errors(c), (0, 0, 0, 2)),
+            indented(_tool_errors(c)),
             bullets([f.words for f in assessed.findings if f.kind not in RESEARCH]),
         ]
     else:
@@ -191,12 +190,8 @@ def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     results = comparison.results
     if not results:
         return Text("No model is identifiable.")
-    order: Sequence[int] = range(len(comparison.labels))
-    note = ""
-    if len(comparison.labels) > MANY_ROWS and not all_rows:
-        largest = [max(abs(r.exact.residuals[i]) for r in results) for i in order]
-        order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]
-        note = f"The {WORST_ROWS} largest of {len(comparison.labels)}; --all lists every reading."
+    largest = np.abs([r.exact.residuals for r in results]).max(axis=0)
+    order, note = choose_worst(range(len(largest)), largest.__getitem__, all_rows=all_rows)
     rows = [
         (comparison.labels[i], *(signed(r.exact.residuals[i] / MM) for r in results)) for i in order
     ]

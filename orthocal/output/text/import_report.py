@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
 from orthocal.printers.log import PrintedDistance
 from orthocal.printers.settings import DeltaSettings
-from orthocal.text import list_some, runs
+from orthocal.text import list_some, quote_path, runs
 from orthocal.units import DEG, MM, to_mm
 
 UNIT_SYMBOLS = {"um": "µm"}
@@ -244,7 +243,7 @@ def format_printer_json(result: PrinterImport, path: Path, written: Path | None)
 def printer_commands(result: PrinterImport, directory: Path) -> str:
     """The next commands after a printer's log."""
     place, one, new = (
-        shlex.quote(str(p)) for p in (directory, directory / "one", directory / result.firmware)
+        quote_path(p) for p in (directory, directory / "one", directory / result.firmware)
     )
     return "\n".join(
         [

@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
+from typing import TypeVar
 
 from rich import box
 from rich.cells import cell_len
@@ -26,6 +27,8 @@ from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.io.html import items, paragraph, table
 from orthocal.text import printable
 from orthocal.units import format_fixed
+
+Row = TypeVar("Row")
 
 MANY_ROWS = 60
 """Readings above which only the worst are listed, unless all are asked for."""
@@ -85,7 +88,7 @@ class NumberTable(Table):
             for header, text in zip(headers[lead:], row[lead:], strict=True):
                 if text:
                     words = f"{header}: {text}" if header else text
-                    yield Padding(Text(words), (0, 0, 0, 2))
+                    yield indented(Text(words))
 
     def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
         """Measure the table; it may be as narrow as its paragraphs (rich's protocol)."""
@@ -169,9 +172,14 @@ def _from_rich(content: Table) -> str:
     return table(headers, zip(*columns, strict=True), left=left)
 
 
+def indented(part: RenderableType) -> RenderableType:
+    """A part that begins two columns later."""
+    return Padding(part, (0, 0, 0, 2))
+
+
 def section(title: str, body: RenderableType) -> RenderableType:
     """A titled, indented part."""
-    return Group(Text(), Text(title, style="bold cyan"), Padding(body, (0, 0, 0, 2)))
+    return Group(Text(), Text(title, style="bold cyan"), indented(body))
 
 
 def bullets(sentences: list[str]) -> RenderableType:
@@ -200,6 +208,11 @@ def table_of(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int
     return table
 
 
+def table_of_records(rows: Sequence[Mapping[str, str]]) -> Table:
+    """A table of rows with the same keys, which are its headers; empty without rows."""
+    return table_of(list(rows[0]) if rows else (), [list(row.values()) for row in rows])
+
+
 def _plain(cell: RenderableType) -> str:
     return cell.plain if isinstance(cell, Text) else str(cell)
 
@@ -219,6 +232,16 @@ def true_minus(text: str) -> str:
     return text.replace("-", "−")
 
 
+def choose_worst(
+    rows: Sequence[Row], key: Callable[[Row], float], *, all_rows: bool
+) -> tuple[Sequence[Row], str]:
+    """The worst of many rows by a key, or all, with a note about omitted ones."""
+    if all_rows or len(rows) <= MANY_ROWS:
+        return rows, ""
+    worst = sorted(rows, key=key, reverse=True)[:WORST_ROWS]
+    return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."
+
+
 def residual_table(
     residuals: Sequence[ResidualRow],
     columns: Mapping[str, Callable[[ResidualRow], str]],
@@ -236,10 +259,7 @@ def residual_table(
         key: Size by which the worst are chosen.
     """
     cycles = any(r.cycle != 1 for r in residuals)
-    rows, note = residuals, ""
-    if len(residuals) > MANY_ROWS and not all_rows:
-        rows = sorted(residuals, key=key, reverse=True)[:WORST_ROWS]
-        note = f"The {WORST_ROWS} largest of {len(residuals)}; --all lists every reading."
+    rows, note = choose_worst(residuals, key, all_rows=all_rows)
     cells = [
         (
             *(r.setup, r.postures),

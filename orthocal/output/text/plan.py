@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
@@ -18,7 +17,12 @@ from orthocal.assessment.words.entries import describe_aligned
 from orthocal.io.documents import format_json
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.reachable_box import find_workspace
-from orthocal.measurement.motion.approach import approach_length, describe_approach
+from orthocal.measurement.motion.approach import (
+    AS_ARROWS_SHOW,
+    FROM_ONE_SIDE,
+    approach_length,
+    describe_approach,
+)
 from orthocal.output.sheet.gauge_position import name_tip
 from orthocal.output.text.accuracy import (
     NOTICEABLE,
@@ -26,7 +30,7 @@ from orthocal.output.text.accuracy import (
     describe_remaining,
     describe_remedy,
 )
-from orthocal.output.text.layout import bullets, counted, plain, section, table_of
+from orthocal.output.text.layout import bullets, counted, indented, section, table_of, um
 from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN, Stage
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Criterion, Expected
@@ -275,14 +279,9 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     length = approach_length(session)
     stated = any(r.approach for r in session.readings)
     if any(tool_path(sensor) is None for sensor in sensors) and not stated:
-        words.append(
-            f"Approach every posture from the same side: the last {length} in one direction."
-        )
+        words.append(FROM_ONE_SIDE.format(length))
     if stated:
-        words.append(
-            f"Approach each posture as its arrows show: in the last {length} the displayed number "
-            "of the joint grows (↑) or falls (↓). The programs do this."
-        )
+        words.append(f"{AS_ARROWS_SHOW.format(length)} The programs do this.")
     return [
         *words,
         "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
@@ -373,17 +372,6 @@ def draw_plan(plan: MeasuringPlan) -> str:
     return plot_plan.document(plan, _unit(plan))
 
 
-def show_um(expected: Expected) -> str:
-    """Expected tool error, [µm]."""
-    return _in_um(expected.reported.rms)
-
-
-def _in_um(error: float) -> str:
-    """A tool error, [m], in µm."""
-    value = error / UM
-    return plain(value, 0 if value >= 20.0 else 1)
-
-
 def show_duration(minutes: float) -> str:
     """Duration in minutes or hours."""
     return f"{minutes:.0f} min" if minutes < 2.0 * HOUR else f"{minutes / HOUR:.1f} h"
@@ -410,16 +398,16 @@ def _when_enough(plan: MeasuringPlan) -> str:
     if enough is None:
         last = plan.curve[-1]
         return (
-            f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {_in_um(last.error)} µm "
-            f"instead of {_in_um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
+            f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {um(last.error)} µm "
+            f"instead of {um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
             f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)}).{other}"
         )
     as_good = plan.stage.minutes <= enough.minutes and plan.stage.error <= enough.error
-    if as_good or _in_um(enough.error) == _in_um(plan.stage.error):
+    if as_good or um(enough.error) == um(plan.stage.error):
         return f"Further setups gain less than {HOURLY_GAIN:.0%} an hour."
     return (
         f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
-        f"{_in_um(enough.error)} µm instead of {_in_um(plan.stage.error)} µm"
+        f"{um(enough.error)} µm instead of {um(plan.stage.error)} µm"
         f"{_second_measurement(plan, ' after ')}. "
         f"More setups gain less than {HOURLY_GAIN:.0%} an hour.{other}"
     )
@@ -435,7 +423,7 @@ def _alternatives(plan: MeasuringPlan) -> RenderableType:
     this = Alternative("this plan", len(s.setups), len(s.readings), plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.usual_plans):
-        error = OUT_OF_RANGE if a.expected is None else show_um(a.expected)
+        error = OUT_OF_RANGE if a.expected is None else um(a.expected.reported.rms)
         name = EVENLY if a.name == "even" else a.name
         rows.append((name, str(a.setups), str(a.readings), show_duration(a.minutes), error))
     headers = ("plan", "setups", "readings", "time", "tool error [µm]")
@@ -471,4 +459,4 @@ def _setups(plan: MeasuringPlan) -> RenderableType:
         for setup in list(s.setups.values())[:MOST_LISTED]
     ]
     table, more = table_of(("setup", "gauge", "postures"), rows, left=3), len(s.setups) - len(rows)
-    return Group(table, Padding(Text(f"and {more} more"), (0, 0, 0, 2))) if more else table
+    return Group(table, indented(Text(f"and {more} more"))) if more else table

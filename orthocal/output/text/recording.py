@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import shutil
 import textwrap
 from collections.abc import Sequence
@@ -17,6 +16,8 @@ from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
 from orthocal.errors import OrthocalError
 from orthocal.measurement.motion.approach import (
+    AS_ARROWS_SHOW,
+    FROM_ONE_SIDE,
     approach_length,
     common_approach,
     describe_approach,
@@ -28,13 +29,13 @@ from orthocal.measurement.recording import RecordedReading, Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
-from orthocal.robot.model import drive_keys
+from orthocal.robot.model import drive_keys, name_coordinates
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name, one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session, Setup
-from orthocal.text import printable, spans
-from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
+from orthocal.text import printable, quote_path, spans
+from orthocal.units import MM, format_fixed, to_mm, trim_zeros
 
 WIDEST = 100
 """Largest width of a line, [columns]."""
@@ -190,13 +191,8 @@ class RecordingText:
                 f"Noted with the next readings, as typed before: {recording.temperature:g} °C. "
                 "`t 20` changes it."
             )
-        length = approach_length(session)
-        parts.append(
-            f"Approach each posture as its arrows show: in the last {length} the displayed number "
-            "of the joint grows (↑) or falls (↓)."
-            if any(r.approach for r in rows)
-            else f"Approach every posture from the same side: the last {length} in one direction."
-        )
+        rule = AS_ARROWS_SHOW if any(r.approach for r in rows) else FROM_ONE_SIDE
+        parts.append(rule.format(approach_length(session)))
         return "\n".join(self.wrap(part) for part in parts)
 
     def _what_to_type(self) -> str:
@@ -308,9 +304,9 @@ class RecordingText:
         return label_reading(self._session.robot, replace(row, setup=row.setup_in_file))
 
     def value(self, index: int) -> str:
-        """Reading of a row, or the coordinates of its point, in mm."""
-        values = np.atleast_1d(self._recording.value(index))
-        return ", ".join(show_mm(v) for v in values.tolist())
+        """Reading of a row, or the coordinates of its point, in mm, with two decimals or more."""
+        values = np.atleast_1d(self._recording.value(index)).tolist()
+        return ", ".join(trim_zeros(f"{to_mm(value) + 0.0:.6f}") for value in values)
 
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
@@ -329,11 +325,10 @@ class RecordingText:
         return "\n".join(lines)
 
     def _coordinates(self, posture: str, name: str) -> str:
-        guidance, parts = self._guidance, []
-        for drive, value in zip(self._session.robot.drives, guidance.joints[posture], strict=True):
-            unit, size = DRIVE_UNITS[drive.unit]
-            parts.append(f"{drive.name} {format_fixed(value / size, 3)} {unit}".replace(" ", GLUE))
-        lines = [self.wrap(f"{name}joints {', '.join(parts)}", indent="  ")]
+        guidance = self._guidance
+        joints = name_coordinates(self._session.robot.drives, guidance.joints[posture])
+        text = ", ".join(joint.replace(" ", GLUE) for joint in joints)
+        lines = [self.wrap(f"{name}joints {text}", indent="  ")]
         if posture in guidance.tool:
             values = zip("xyz", guidance.tool[posture], strict=True)
             tool = ", ".join(f"{axis}{GLUE}{format_fixed(v / MM, 3)}" for axis, v in values)
@@ -473,7 +468,7 @@ class RecordingText:
             path: Path of the session as it was typed.
         """
         recording, session, rows = self._recording, self._session, self._recording.rows
-        command = printable(shlex.quote(path))
+        command = quote_path(path)
         if recording.missing:
             parts = []
             for setup in dict.fromkeys(rows[i].setup_in_file for i in recording.missing):
@@ -491,8 +486,7 @@ class RecordingText:
             return f"{self.wrap(state)}\nContinue with:\n  orthocal record {command}"
         lines = [f"All {counted(recording.count, 'reading')} are recorded."]
         if session.controller_offsets is None:
-            drives = session.robot.drives
-            keys = drive_keys("offsets", drives, [0.0] * len(drives))
+            keys = drive_keys("offsets", session.robot.drives)
             lines.append(
                 "State in session.yaml which offsets are active in the controller, one number per "
                 f"drive, such as `controller: {{{keys}}}`. Without them only their "
@@ -509,14 +503,9 @@ class RecordingText:
                 f"or calibrate all sessions together:\n  {together}"
             )
             if session.offsets_from is not None:
-                entered = printable(shlex.quote(str(session.offsets_from)))
+                entered = quote_path(session.offsets_from)
                 following = f"Next:\n  orthocal validate {entered} {command}"
         return "\n".join([*(self.wrap(line) for line in lines), following])
-
-
-def show_mm(value: float) -> str:
-    """A reading in mm with all its decimals, two at least."""
-    return trim_zeros(f"{to_mm(value) + 0.0:.6f}")
 
 
 def _name_gauge(setup: Setup, *, stand: bool = False) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -104,7 +105,7 @@ def study_json(table: StudyTable, report: StudyReport) -> str:
         "answer": report.answer,
         "summary": report.document,
     }
-    return format_json(_finite(document))
+    return format_json(to_jsonable_python(document, inf_nan_mode="null"))
 
 
 def render_report(report: StudyReport) -> RenderableType:
@@ -156,7 +157,16 @@ def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
     }
     tables: tuple[RenderableType, ...] = ()
     if s.machines:
-        tables = (_tool_table(s, predicted), _estimate_table(parameters, all_rows))
+        rows = [
+            (
+                *(_number(p[name]) for name in ("rms", "standard_error", "predicted")),
+                f"{100.0 * p['relative']:.0f} %",
+            )
+            for p in parameters
+        ]
+        header = ("error", "std. error", "predicted", "of its prior")
+        estimates = _parameter_table(header, parameters, rows, "The {} least certain", all_rows)
+        tables = (_tool_table(s, predicted), section("Errors of the estimates, RMS", estimates))
     notes = tuple(
         f"Not calibrated: {counted(n, 'machine')} ({reason})." for reason, n in s.failed.items()
     )
@@ -210,44 +220,45 @@ def _tool_table(s: AccuracySummary, predicted: dict[str, float]) -> RenderableTy
     return section("Tool error, RMS", table_of(header, rows))
 
 
-def _estimate_table(parameters: Sequence[dict[str, Any]], all_rows: bool) -> RenderableType:
-    shown = parameters if all_rows else parameters[:MOST_ROWS]
-    rows = [
-        (
-            p["name"],
-            *(_number(p[name]) for name in ("rms", "standard_error", "predicted")),
-            f"{100.0 * p['relative']:.0f} %",
-            p["unit"],
-        )
-        for p in shown
-    ]
-    header = ("parameter", "error", "std. error", "predicted", "of its prior", "unit")
+def _parameter_table(
+    header: Sequence[str],
+    parameters: Sequence[dict[str, Any]],
+    rows: Sequence[Sequence[str]],
+    order: str,
+    all_rows: bool,
+) -> RenderableType:
+    """Table with a row of numbers for each parameter, for the first ones only or for all.
+
+    Args:
+        header: Headers of the numbers.
+        parameters: The parameters, with their names and units.
+        rows: Numbers of each parameter.
+        order: Words for the parameters that are listed; {} is their number.
+        all_rows: Whether to list all.
+    """
+    cells = [(p["name"], *row, p["unit"]) for p, row in zip(parameters, rows, strict=True)]
+    shown = cells if all_rows else cells[:MOST_ROWS]
     omitted = ""
-    if len(shown) < len(parameters):
-        omitted = f"The {len(shown)} least certain of {len(parameters)}; --all lists all."
-    return section("Errors of the estimates, RMS", noted(table_of(header, rows), omitted))
+    if len(shown) < len(cells):
+        omitted = f"{order.format(len(shown))} of {len(cells)}; --all lists all."
+    return noted(table_of(("parameter", *header, "unit"), shown), omitted)
 
 
 def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
     s = summarise_bootstrap(table.study, table)  # type: ignore[arg-type] # by its kind
     names = ("estimate", "std", "standard_error", "low", "high", "predicted", "model_std")
     parameters = _parameters(s.parameters, names)
-    shown = parameters if all_rows else parameters[:MOST_ROWS]
     rows = [
         (
-            p["name"],
             f"{p['estimate']:+.3f}",
             *(_number(p[name]) for name in ("std", "predicted")),
             f"{p['low']:+.3f} … {p['high']:+.3f}",
             _number(p["model_std"]),
-            p["unit"],
         )
-        for p in shown
+        for p in parameters
     ]
-    header = ("parameter", "estimate", "std", "predicted std", "95 % of draws", "model std", "unit")
-    omitted = ""
-    if len(shown) < len(parameters):
-        omitted = f"The first {len(shown)} of {len(parameters)}; --all lists all."
+    header = ("estimate", "std", "predicted std", "95 % of draws", "model std")
+    estimates = _parameter_table(header, parameters, rows, "The first {}", all_rows)
     notes = (
         "std and predicted std: by noise alone. Model std: with the prior, but without errors "
         "that are not identified.",
@@ -258,7 +269,7 @@ def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
         "fewest_cycles": s.fewest_cycles,
         "parameters": parameters,
     }
-    tables = (section("Estimates", noted(table_of(header, rows), omitted)),)
+    tables = (section("Estimates", estimates),)
     return StudyReport("bootstrap", _bootstrap_answer(s), tables, (s,), document, notes)
 
 
@@ -426,13 +437,3 @@ def _number(value: float) -> str:
     if abs(value) < 5e-7:
         return "0"
     return f"{value:.3g}" if abs(value) >= 1e-4 else f"{value:.6f}"
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401 - plain data
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

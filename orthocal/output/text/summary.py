@@ -21,7 +21,7 @@ from orthocal.output.text.answer import (
     render_method,
     render_values,
 )
-from orthocal.output.text.layout import print_rich, section, to_markup, to_text
+from orthocal.output.text.layout import section, to_markup, to_text
 
 if TYPE_CHECKING:
     from orthocal.assessment.comparison import Comparison
@@ -45,13 +45,6 @@ def summarize(
     """
     content = render_result(result, details=details, all_rows=all_rows)
     return to_markup(content) if html else to_text(content)
-
-
-def print_summary(
-    result: Result, *, details: bool = False, all_rows: bool = False, saved: Path | None = None
-) -> None:
-    """Print a result: in colour on a terminal. For arguments see `render_result`."""
-    print_rich(render_result(result, details=details, all_rows=all_rows, saved=saved))
 
 
 def render_result(

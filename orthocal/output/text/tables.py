@@ -29,6 +29,7 @@ from orthocal.output.text.layout import (
     residual_table,
     signed,
     table_of,
+    table_of_records,
 )
 from orthocal.robot.parameters import is_offset
 from orthocal.text import list_some
@@ -64,45 +65,37 @@ MOST_PAIRS = 8
 def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
     """Estimates and expanded uncertainties of the identified parameters, or of all."""
     c, prior = calibration, calibration.prior
-    linear = c.solver.name == "linearised"
     profiled = any(p.interval for p in c.free)
     by_noise = all_rows and any(p.std_scatter < p.std for p in c.free)
     in_std = c.solver.shows_linearisation_error and not profiled
     shifts = in_std and not prior
-    headers = (
-        "parameter",
-        *(["linearised"] if linear else ["linear", "exact"]),
-        "±",
-        *(["± by noise"] if by_noise else []),
-        *(["resolved"] if prior else []),
-        *(["95 % profile interval"] if profiled else []),
-        *(["exact − linear"] if shifts else []),
-        *(["in std" if shifts else "exact − linear [std]"] if in_std else []),
-        "unit",
-    )
     few = all_rows or len(c.free) <= MANY_PARAMETERS
     rows = []
     for p, half in zip(c.free, c.expanded_uncertainties.tolist(), strict=True):
         if not (few or _is_listed(p)):
             continue
         f, shift = p.edge_factor, p.value - p.linear
-        noise = min(half, float(c.expand(p.std_scatter, p.std_scatter, 0.0)))
-        resolved = f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
-        row = (
-            p.name,
-            *([] if linear else [signed(p.linear * f)]),
-            signed(p.value * f),
-            "at bound" if p.at_bound else plain(half * f),
-            *([plain(noise * f)] if by_noise else []),
-            *([resolved] if prior else []),
-            *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
-            *([signed(shift * f, 4)] if shifts else []),
-            *([f"{shift / p.std:+.3f}" if p.std > 0.0 else ""] if in_std else []),
-            p.edge_unit,
-        )
-        rows.append(row)
+        row = {"parameter": p.name}
+        if c.solver.name == "linearised":
+            row["linearised"] = signed(p.value * f)
+        else:
+            row |= {"linear": signed(p.linear * f), "exact": signed(p.value * f)}
+        row["±"] = "at bound" if p.at_bound else plain(half * f)
+        if by_noise:
+            noise = min(half, float(c.expand(p.std_scatter, p.std_scatter, 0.0)))
+            row["± by noise"] = plain(noise * f)
+        if prior:
+            row["resolved"] = f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
+        if profiled:
+            row["95 % profile interval"] = _interval(*p.interval, f) if p.interval else ""
+        if shifts:
+            row["exact − linear"] = signed(shift * f, 4)
+        if in_std:
+            header = "in std" if shifts else "exact − linear [std]"
+            row[header] = f"{shift / p.std:+.3f}" if p.std > 0.0 else ""
+        rows.append(row | {"unit": p.edge_unit})
     notes = _parameter_notes(c, omitted=len(c.free) - len(rows), by_noise=by_noise)
-    return noted(table_of(headers, rows), *notes)
+    return noted(table_of_records(rows), *notes)
 
 
 def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[str]:
