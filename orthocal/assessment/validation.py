@@ -53,8 +53,7 @@ from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
-from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
-from orthocal.hypotheses.search import find_anomalies
+from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import (
@@ -235,11 +234,10 @@ def validate_calibration(
     fit, refit = _refit(calibration, join_sessions(measured))
     before = restore_session(calibration)
     all_sessions = join_sessions([before, *measured])
-    anomalies = find_anomalies(all_sessions)
-    judgement = judge_session(all_sessions, anomalies=anomalies)
-    mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
+    judgement = judge_session(all_sessions)
+    mistake = next((a for a in judgement.anomalies if a.explanation.sessions), None)
     expected, test = expect_deviations(calibration, fit), judge_deviations(calibration, fit)
-    explained = _explain_deviations(anomalies, before, fit.problem.session)
+    explained = _explain_deviations(judgement, before, fit.problem.session)
     agreement = _describe_agreement(refit, fit, test, expected.rms, judgement, explained=explained)
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
@@ -339,15 +337,15 @@ def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) ->
     return True if judgement.verdict == "enter" else None
 
 
-def _explain_deviations(anomalies: Anomalies, before: Session, new: Session) -> bool:
+def _explain_deviations(judgement: Judgement, before: Session, new: Session) -> bool:
     """True if wrong new readings explain deviations.
 
     Each anomaly is then one of new rows, which follow those of the calibration. Without anomalies,
     only new readings do not repeat.
     """
-    if not anomalies.found:
+    if not judgement.anomalies:
         return bool(find_scattered(new)) and not find_scattered(before)
-    found = [e for a in anomalies.found for e in (a.explanation, *a.causes, *a.alternatives)]
+    found = [e for a in judgement.anomalies for e in (a.explanation, *a.causes, *a.alternatives)]
     return all(e.rows and min(e.rows) >= len(before.readings) for e in found)
 
 
