@@ -78,6 +78,10 @@ ROUNDING = 0.02e-3
 """Difference of a stated offset from the calibrated one that is always allowed: 0.02 mm or
 0.02 mrad, [m, rad]."""
 
+LARGER_TOOL_ERROR = 1.2
+"""Ratio of the expected tool errors after and before the new readings from which both are stated.
+Smaller ones differ by the rounding of the printed numbers."""
+
 ENTRY_KINDS: tuple[FindingKind, ...] = (
     "no offset",
     "no change needed",
@@ -242,6 +246,8 @@ def validate_calibration(
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
+    if confirmed and joint is not None:
+        agreement = _compare_tool_errors(agreement, calibration, joint)
     wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
     entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
@@ -490,6 +496,18 @@ def _describe_agreement(
         )
         return replace(finding, severity="note") if explained else finding
     return words.as_predicted(achieved, limit, expected, numbers)
+
+
+def _compare_tool_errors(agreement: Finding, before: Calibration, joint: Calibration) -> Finding:
+    """Agreement of the readings, with both tool errors if new readings show a larger one.
+
+    The expected tool error is a mean over all machines that agree with the readings. That of one
+    machine, on which new readings agree with the predictions, may be larger.
+    """
+    promised, tool = assessment_of(before).tool, assessment_of(joint).tool
+    if promised is None or tool is None or not tool.now > LARGER_TOOL_ERROR * promised.entered:
+        return agreement
+    return words.with_tool_errors(agreement, promised.entered, tool.now)
 
 
 def _choose_entries(
