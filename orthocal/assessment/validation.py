@@ -246,8 +246,7 @@ def validate_calibration(
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
-    if confirmed and joint is not None:
-        agreement = _compare_tool_errors(agreement, calibration, joint)
+    agreement = _compare_tool_errors(agreement, calibration, joint)
     wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
     entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
@@ -498,12 +497,16 @@ def _describe_agreement(
     return words.as_predicted(achieved, limit, expected, numbers)
 
 
-def _compare_tool_errors(agreement: Finding, before: Calibration, joint: Calibration) -> Finding:
+def _compare_tool_errors(
+    agreement: Finding, before: Calibration, joint: Calibration | None
+) -> Finding:
     """Agreement of the readings, with both tool errors if new readings show a larger one.
 
     The expected tool error is a mean over all machines that agree with the readings. That of one
     machine, on which new readings agree with the predictions, may be larger.
     """
+    if joint is None:
+        return agreement
     promised, tool = assessment_of(before).tool, assessment_of(joint).tool
     if promised is None or tool is None or not tool.now > LARGER_TOOL_ERROR * promised.entered:
         return agreement
