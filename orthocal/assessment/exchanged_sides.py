@@ -12,7 +12,7 @@ search for anomalies does not see this mistake, because its model allows negativ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from orthocal.assessment.recommendation import weigh_scales
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding
+from orthocal.hypotheses.anomaly import Anomalies
+from orthocal.hypotheses.family_scores import N_FAMILIES, SIMILAR_LOG_BAYES
 from orthocal.hypotheses.likelihood import (
     SCALE_NODES,
     TOLERANCE_SCALE_SPREAD,
@@ -29,14 +31,57 @@ from orthocal.hypotheses.likelihood import (
     log_of_sum,
 )
 from orthocal.hypotheses.linear_model import linear_model
+from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 
 EXCHANGED_EVIDENCE = 10.0
 """ln evidence above which the sides of approach of a setup are exchanged."""
 
+OTHER_SIDE = str.maketrans("pn", "np")
+"""Letters of the other sides of approach."""
+
 EQUAL_EVIDENCE = 1.5
 """Difference of ln evidence up to which two explanations are equally good."""
+
+
+def weigh_exchanged_sides(
+    session: Session, anomalies: Anomalies
+) -> tuple[Anomalies, tuple[Finding, ...]]:
+    """Anomalies beside exchanged sides of approach, and findings about these sides.
+
+    Sides that were exchanged in one of several joined sessions look like a change between them. So
+    anomalies are compared with those of the session with the right sides. The more likely ones
+    count; findings about both are returned if they are nearly equally likely.
+
+    Args:
+        session: A session, or several joined ones.
+        anomalies: Anomalies of its readings with the stated sides.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+        RobotError: If closures of the robot depend on each other.
+    """
+    findings = find_exchanged_sides(session)
+    if not findings or (anomalies.explained and not anomalies.found):
+        return anomalies, findings
+    right = find_anomalies(exchange_sides(session, {p.setup for f in findings for p in f.places}))
+    choices = N_FAMILIES * (1 + 2 * len(session.setups))
+    log_odds = right.log_posterior - float(np.log(choices)) - anomalies.log_posterior
+    if log_odds < -SIMILAR_LOG_BAYES:
+        return anomalies, ()
+    return (right if log_odds > SIMILAR_LOG_BAYES else anomalies), findings
+
+
+def exchange_sides(session: Session, setups: Collection[str | None]) -> Session:
+    """Session with the other side of approach in all readings of some setups."""
+    readings = tuple(
+        replace(r, conditions=replace(r.conditions, approach=r.approach.translate(OTHER_SIDE)))
+        if r.setup in setups and r.approach and r.conditions
+        else r
+        for r in session.readings
+    )
+    return replace(session, readings=readings)
 
 
 def find_exchanged_sides(session: Session) -> tuple[Finding, ...]:

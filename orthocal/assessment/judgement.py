@@ -15,7 +15,7 @@ import numpy as np
 from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.effect_separability import find_unshown_effects
-from orthocal.assessment.exchanged_sides import find_exchanged_sides
+from orthocal.assessment.exchanged_sides import weigh_exchanged_sides
 from orthocal.assessment.plausibility import (
     are_finer,
     find_finer,
@@ -32,7 +32,7 @@ from orthocal.assessment.words.anomalies import (
 )
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale, trial_scales
-from orthocal.hypotheses.anomaly import Anomalies
+from orthocal.hypotheses.anomaly import Anomaly
 from orthocal.hypotheses.families.sessions import detectable_changes
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
@@ -82,6 +82,8 @@ class Judgement:
     """Factor by which the machine's errors exceed their tolerances; 1 if they do not."""
     values: Array | None = None
     """Readings that were judged, shape (n_readings,), [m]; None for any readings."""
+    anomalies: tuple[Anomaly, ...] = ()
+    """Anomalies behind the findings."""
 
     @property
     def verdict(self) -> Verdict:
@@ -125,7 +127,7 @@ def rank(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda f: _GRAVITY[f.severity]))
 
 
-def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Judgement:
+def judge_session(session: Session) -> Judgement:
     """Judge the readings of a session, or of several that were joined.
 
     The judgement does not depend on the model. `calibrate`, `assess`, `compare_models` and
@@ -133,7 +135,6 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
 
     Args:
         session: The session.
-        anomalies: Anomalies of its readings, if they were found already.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -142,7 +143,7 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     """
     require_kind(session, Session, expected="a Session, as load_session returns")
     require_complete(session)
-    mistakes = _find_mistakes(session, anomalies)
+    mistakes, anomalies = _find_mistakes(session)
     implausible = find_implausible(session, explained=bool(mistakes))
     if any(f.kind == "wrong dimensions" for f in implausible):
         implausible = _explain_dimensions(session, implausible)
@@ -161,6 +162,7 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
         rank([*implausible, *mistakes, *order, *no_change, *scale_findings, *unshown_effects]),
         scale,
         session.values,
+        anomalies,
     )
 
 
@@ -174,7 +176,7 @@ def find_warnings(session: Session) -> tuple[Finding, ...]:
         ClosureError: If the machine cannot reach a posture.
         RobotError: If the closures of the robot depend on each other.
     """
-    mistakes = _find_mistakes(session)
+    mistakes, _ = _find_mistakes(session)
     return rank([*mistakes, *(() if mistakes else find_finer(session))])
 
 
@@ -203,23 +205,21 @@ def is_far(value: float, mean: float, std: float) -> bool:
     return bool(abs(value - mean) > LARGEST_DEVIATION * std)
 
 
-def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list[Finding]:
-    """Findings about anomalies; if there are none, about readings that do not repeat.
+def _find_mistakes(session: Session) -> tuple[list[Finding], tuple[Anomaly, ...]]:
+    """Findings about anomalies and exchanged sides of approach, and the anomalies.
 
-    If a gauge is impossible as stated, the findings are about gauges alone. But readings in another
-    unit are multiples of a coarser step, too.
-
-    Args:
-        session: The session.
-        anomalies: Its anomalies, if they were found already.
+    Without anomalies the findings are about readings that do not repeat. If a gauge is impossible
+    as stated, they are about gauges alone. But readings in another unit are multiples of a coarser
+    step, too.
     """
     impossible = list(find_impossible_gauges(session))
     if any(f.kind != "resolution too fine" for f in impossible):
-        return impossible
-    findings = describe_anomalies(session, anomalies or find_anomalies(session))
+        return impossible, ()
+    result, exchanged = weigh_exchanged_sides(session, find_anomalies(session))
+    findings = describe_anomalies(session, result)
     if impossible and not any(f.kind in ("decimal point", "wrong unit") for f in findings):
-        return impossible
-    return findings or [*find_scattered(session), *find_exchanged_sides(session)]
+        return impossible, ()
+    return [*(findings or find_scattered(session)), *exchanged], result.found
 
 
 def find_tolerance_scale(session: Session) -> ToleranceScale:

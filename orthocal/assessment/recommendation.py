@@ -6,9 +6,9 @@ or another tolerance scale. The evidence is the marginal likelihood of the linea
     p(y | M) = ∫ p(y | θ, σ) p(θ | M) dθ.
 
 The parameters of the model have their prior standard deviations times the tolerance scale; all
-other errors are 0. Gauge zeros have flat priors. Parameters that are never negative have
-half-normal priors. σ is the stated noise of a reading with its rounding. If none is stated, the
-evidence is integrated over σ with a broad prior.
+other errors are 0. Joined sessions are of one machine, so they share θ. Gauge zeros have flat
+priors. Parameters that are never negative have half-normal priors. σ is the stated noise of a
+reading with its rounding. If none is stated, the evidence is integrated over σ with a broad prior.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from orthocal.estimation.tolerance_scale import trial_scales
 from orthocal.hypotheses.likelihood import NOISE_SCALES, log_normal, log_of_sum, noise_weights
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
-from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 
 CACHE_SIZE = 4
@@ -72,7 +71,7 @@ def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendat
     scale if the evidence for it is strong.
 
     Args:
-        session: The session, or several that were joined: their log evidence is added.
+        session: The session, or several that were joined.
         models: Models of the robot to compare with the complete model; by default all.
 
     Raises:
@@ -117,16 +116,12 @@ def compute_log_evidence(
         model: Name of the model.
         noise_effects: As for `LinearModel`, to compare sets of effects with the same noise.
     """
-    total, by_scale = 0.0, np.zeros(TRIAL_SCALES.size)
-    for part in split_sessions(session):
-        if len(part.readings) < 2:  # one reading usually determines only a gauge zero
-            continue
-        linear = linear_model(part, model, noise_effects=noise_effects)
-        about, scales = linear.most_likely(part.values), np.append(1.0, TRIAL_SCALES)
-        evidence = weigh_scales(linear, about, part.values, scales)
-        total += float(evidence[0])
-        by_scale += evidence[1:]
-    return total, by_scale
+    if len(session.readings) < 2:  # one reading usually determines only a gauge zero
+        return 0.0, np.zeros(TRIAL_SCALES.size)
+    linear = linear_model(session, model, noise_effects=noise_effects)
+    about, scales = linear.most_likely(session.values), np.append(1.0, TRIAL_SCALES)
+    evidence = weigh_scales(linear, about, session.values, scales)
+    return float(evidence[0]), evidence[1:]
 
 
 def weigh_scales(

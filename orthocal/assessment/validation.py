@@ -53,8 +53,7 @@ from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
-from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
-from orthocal.hypotheses.search import find_anomalies
+from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import (
@@ -78,6 +77,10 @@ scatter."""
 ROUNDING = 0.02e-3
 """Difference of a stated offset from the calibrated one that is always allowed: 0.02 mm or
 0.02 mrad, [m, rad]."""
+
+LARGER_TOOL_ERROR = 1.2
+"""Ratio of the expected tool errors after and before the new readings from which both are stated.
+Smaller ones differ by the rounding of the printed numbers."""
 
 ENTRY_KINDS: tuple[FindingKind, ...] = (
     "no offset",
@@ -237,15 +240,15 @@ def validate_calibration(
     refit = assemble_calibration(fit, nominal=predicted)
     before = restore_session(calibration)
     all_sessions = join_sessions([before, *measured])
-    anomalies = find_anomalies(all_sessions)
-    judgement = judge_session(all_sessions, anomalies=anomalies)
-    mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
+    judgement = judge_session(all_sessions)
+    mistake = next((a for a in judgement.anomalies if a.explanation.sessions), None)
     expected, test = expect_deviations(calibration, fit), judge_deviations(calibration, fit)
-    explained = _explain_deviations(anomalies, before, fit.problem.session)
+    explained = _explain_deviations(judgement, before, fit.problem.session)
     agreement = _describe_agreement(refit, fit, test, expected.rms, judgement, explained=explained)
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = _calibrate_jointly(calibration, all_sessions, judgement, confirmed)
     confirmed = confirmed and joint is not None
+    agreement = _compare_tool_errors(agreement, calibration, joint)
     wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
     entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
@@ -332,15 +335,15 @@ def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) ->
     return True if judgement.verdict == "enter" else None
 
 
-def _explain_deviations(anomalies: Anomalies, before: Session, new: Session) -> bool:
+def _explain_deviations(judgement: Judgement, before: Session, new: Session) -> bool:
     """True if wrong new readings explain deviations.
 
     Each anomaly is then one of new rows, which follow those of the calibration. Without anomalies,
     only new readings do not repeat.
     """
-    if not anomalies.found:
+    if not judgement.anomalies:
         return bool(find_scattered(new)) and not find_scattered(before)
-    found = [e for a in anomalies.found for e in (a.explanation, *a.causes, *a.alternatives)]
+    found = [e for a in judgement.anomalies for e in (a.explanation, *a.causes, *a.alternatives)]
     return all(e.rows and min(e.rows) >= len(before.readings) for e in found)
 
 
@@ -485,6 +488,22 @@ def _describe_agreement(
         )
         return replace(finding, severity="note") if explained else finding
     return words.as_predicted(achieved, limit, expected, numbers)
+
+
+def _compare_tool_errors(
+    agreement: Finding, before: Calibration, joint: Calibration | None
+) -> Finding:
+    """Agreement of the readings, with both tool errors if new readings show a larger one.
+
+    The expected tool error is a mean over all machines that agree with the readings. That of one
+    machine, on which new readings agree with the predictions, may be larger.
+    """
+    if joint is None:
+        return agreement
+    promised, tool = assessment_of(before).tool, assessment_of(joint).tool
+    if promised is None or tool is None or not tool.now > LARGER_TOOL_ERROR * promised.entered:
+        return agreement
+    return words.with_tool_errors(agreement, promised.entered, tool.now)
 
 
 def _choose_entries(

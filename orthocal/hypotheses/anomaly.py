@@ -186,6 +186,9 @@ class Anomalies:
     suspected: tuple[int, ...] = ()
     """Rows of the most likely further mistakes, if anomalies were found and do not explain the
     readings."""
+    log_posterior: float = 0.0
+    """Logarithm of marginal likelihood times prior of the found anomalies, which compares different
+    statements about the same readings."""
 
     @property
     def ambiguous(self) -> bool:

@@ -347,6 +347,7 @@ class _Search:
             state.score.tolerance_scale,
             state.score.noise_scale,
             () if explained or not state.terms else self.suspected_rows(state),
+            state.log_posterior,
         )
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import SOUND, calibrated, session_of
+from calibrated import SOUND, calibrated, plan_of, session_of
 from gauges import with_gauges, with_scatter
 
-from orthocal import calibrate, summarize
+from orthocal import calibrate, draw_errors, join_sessions, simulate_session, summarize
 from orthocal.assessment.comparison import compare_models, find_known_noises
 from orthocal.assessment.recommendation import (
     STRONG,
@@ -22,6 +22,7 @@ from orthocal.assessment.scores import score_model
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.comparison import describe_recommendation
 from orthocal.errors import ParameterError
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
@@ -398,6 +399,24 @@ def test_readings_without_deviation_support_offsets_and_small_tolerances(raw_cyc
     assert recommendation.log_evidence_of("offsets") > STRONG
     assert recommendation.tolerance_scale < 0.2
     assert math.isfinite(found["lengths"].exact.aicc)
+
+
+def test_more_sessions_of_one_machine_support_its_errors_more():
+    """Errors of 0.3 tolerances repeat in all sessions: each new one speaks against none of them.
+
+    As readings of three different machines they would support the offsets alone.
+    """
+    plan = plan_of("workshop")
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=0)
+    errors = {n: (0.2 if n.endswith(".offset") else 0.3) * e for n, e in errors.items()}
+    near = [round(errors[f"{d.name}.offset"], 5) for d in plan.robot.drives]
+    plans = [plan.with_controller(np.zeros(3)), *[plan.with_controller(near)] * 2]
+    sessions = [simulate_session(p, errors, seed=k).session for k, p in enumerate(plans)]
+    first, *others = (
+        recommend_model(join_sessions(sessions[:n]), ["offsets"]).log_evidence_of("offsets")
+        for n in (1, 2, 3)
+    )
+    assert first > others[0] > others[1]
 
 
 def test_one_tolerance_scale_is_stated():

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from orthocal import calibrate, check_session, draw_errors, load_plan, simulate_session
+from orthocal import (
+    calibrate,
+    check_session,
+    draw_errors,
+    join_sessions,
+    load_plan,
+    simulate_session,
+)
 from orthocal.assessment.exchanged_sides import find_exchanged_sides
+from orthocal.assessment.judgement import judge_session
 from orthocal.effects.compensation import JointTrim
 from orthocal.session.session import Conditions, Gauge
 
@@ -57,6 +65,34 @@ def test_exchanged_sides_are_named_with_their_setups(sided, which):
     assert all(name in finding.text for name in setups)
     assessment = check_session(with_exchanged_sides(session, setups))
     assert assessment.decision.verdict == "review"
+
+
+@pytest.mark.parametrize(
+    ("exchanged", "compensated", "named"),
+    [
+        ((), False, set()),
+        ((0,), False, {"session-1"}),
+        ((1,), False, {"session-2"}),
+        ((0, 1), False, {"session-1", "session-2"}),
+        ((0, 1), True, {"session-1"}),  # the second one shows no backlash that has a sign
+    ],
+)
+def test_exchanged_sides_of_joined_sessions_are_no_change_between_them(
+    sided, exchanged, compensated, named
+):
+    first = sided(0)
+    errors = draw_errors(first.robot, ["*"], seed=0, tolerances={"*.offset_mm": 4.0}) | BACKLASHES
+    plan = first
+    if compensated:
+        plan = replace(first, compensation=tuple(map(JointTrim, BACKLASHES.values())))
+    sessions = [first, simulate_session(plan, errors, seed=1000).session]
+    for k in exchanged:
+        sessions[k] = with_exchanged_sides(sessions[k], sessions[k].setups)
+    judgement = judge_session(join_sessions(sessions))
+    assert not any(a.between_sessions for a in judgement.anomalies)
+    found = [f for f in judgement.findings if f.kind == "sides exchanged"]
+    assert {p.setup.partition("/")[0] for f in found for p in f.places} == named
+    assert (judgement.verdict == "review") == bool(named)
 
 
 def test_sides_of_sound_sessions_are_not_exchanged(sided):

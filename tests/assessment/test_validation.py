@@ -44,8 +44,8 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
-from orthocal.assessment.validation import ENTRY_KINDS, _with_active_offsets
-from orthocal.assessment.wording import join_texts
+from orthocal.assessment.validation import ENTRY_KINDS, _compare_tool_errors, _with_active_offsets
+from orthocal.assessment.wording import join_texts, tool_mm
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
@@ -129,6 +129,24 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(paper, experiment_3
     assert document["schema"] == "orthocal/validation/4"
     assert document["confirmed"] is True
     assert document["nothing_to_change"] is True
+
+
+@pytest.mark.parametrize(("ratio", "stated"), [(0.6, False), (1.1, False), (2.0, True)])
+def test_a_larger_tool_error_than_before_is_stated_beside_the_confirmation(paper, ratio, stated):
+    assessment = assessment_of(paper)
+    promised = assessment.tool.entered
+    tool = replace(assessment.tool, now=ratio * promised)
+    joint = replace(paper, assessment=replace(assessment, tool=tool))
+    agreement = words.as_predicted(1e-5, 2e-5, 1e-5, {"chance": 0.5})
+    found = _compare_tool_errors(agreement, paper, joint)
+    assert (found.kind, found.severity) == (agreement.kind, "note")
+    assert (found.text != agreement.text) == stated
+    assert found.text.startswith(agreement.text)
+    if stated:
+        assert found.numbers["before_um"] == pytest.approx(promised * 1e6)
+        assert found.numbers["now_um"] == pytest.approx(2.0 * promised * 1e6)
+        assert tool_mm(tool.now) in found.text
+        assert tool_mm(promised) in found.text
 
 
 @pytest.mark.slow

@@ -267,10 +267,10 @@ def print_backlash(console: Console, sessions: int) -> None:
                 accused = named = 0
                 for seed in range(count):
                     session = compensated_session(plan, seed, parts, level=level, earlier=earlier)
-                    found = search.find_anomalies(session)
-                    accused += judge_session(session, anomalies=found).verdict != "enter"
-                    kinds = [a.explanation.kind.partition(" ")[0] for a in found.found]
-                    drives = [a.explanation.drives for a in found.found]
+                    judgement = judge_session(session)
+                    accused += judgement.verdict != "enter"
+                    kinds = [a.explanation.kind.partition(" ")[0] for a in judgement.anomalies]
+                    drives = [a.explanation.drives for a in judgement.anomalies]
                     named += kinds == ["backlash"] and (drives == [wrong] or not wrong)
                 row = ("two" if earlier else "one", name, f"{level:g}", count, accused, named)
                 table.add_row(*map(str, row))

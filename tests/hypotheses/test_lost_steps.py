@@ -54,7 +54,7 @@ def test_lost_steps_are_named_with_drive_place_and_amount(plan, drive, row, size
     assert abs(e.first - 18 - row) <= 2
     assert e.amount == pytest.approx(size, abs=4.0 * e.std)
     assert found.explained
-    assessment = judge_session(session, anomalies=found)
+    assessment = judge_session(session)
     (finding,) = [f for f in assessment.findings if f.kind == "lost steps"]
     assert assessment.verdict == "review"
     assert {p.parameter for p in finding.places} == {drive}

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from orthocal.assessment.predictive import MIN_ROWS, Repetition
-from orthocal.assessment.wording import joined, mm, note, parameter_places, plain, review, signed
+from orthocal.assessment.wording import (
+    joined,
+    mm,
+    note,
+    parameter_places,
+    plain,
+    review,
+    signed,
+    tool_mm,
+)
 from orthocal.calibration.assessment_record import ControllerEntry, Finding, Place
-from orthocal.units import MM
+from orthocal.units import MM, UM
 
 CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
@@ -95,6 +105,23 @@ def as_predicted(
         f"The new readings agree with the predictions: they deviate by {deviations}.",
         **numbers,
     )
+
+
+def with_tool_errors(agreement: Finding, before: float, now: float) -> Finding:
+    """Finding about deviations as predicted, with a tool error that is larger than before.
+
+    Args:
+        agreement: The finding.
+        before: Expected tool error with the present offsets before the new readings, [m].
+        now: The same from all readings, [m].
+    """
+    text = (
+        f"{agreement.text} This test compares readings, not tool errors. From all readings, the "
+        f"expected tool error with the present offsets is {tool_mm(now)}, not {tool_mm(before)} as "
+        "before."
+    )
+    numbers = {"before_um": before / UM, "now_um": now / UM}
+    return replace(agreement, text=text, numbers={**agreement.numbers, **numbers})
 
 
 def _with_limit(achieved: float, limit: float) -> str:
