@@ -93,7 +93,7 @@ def again(
     note_beyond_limits(new, ini)
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
-    put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
+    put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, sheet.html and its programs")
 
 
 def _write(new: orthocal.Session, out: Path, validating: str) -> None:

@@ -279,10 +279,12 @@ class LegIndicator:
         if self.rod is not None:
             words += f", {self.tip.form} on rod {self.rod}"
         if any(self.beside):
-            offset = " ".join(
-                f"{axis} {v / MM:+g}" for axis, v in zip("xyz", self.beside, strict=True) if v
-            )
-            words += f", {offset} mm off its centre line"
+            offsets = [
+                f"{abs(v) / MM:g} mm towards {'+' if v > 0.0 else '−'}{axis}"
+                for axis, v in zip("xyz", self.beside, strict=True)
+                if v
+            ]
+            words += f", off its centre line by {' and '.join(offsets)}"
         return words
 
     def frames(self, robot: Robot) -> Frames:

@@ -26,7 +26,7 @@ def test_drives_and_verbs_have_one_number():
     assert words.must_change(ONE).text == "x_slide changes by more than its uncertainty."
     assert words.not_significant(TWO).text == (
         "x_slide and y_slide change by less than their uncertainty. "
-        "Enter all offsets together or none: the tool error depends on all of them."
+        "Enter all offsets together: the tool error depends on all of them."
     )
 
 

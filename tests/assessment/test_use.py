@@ -74,7 +74,7 @@ def calibration(tmp_path_factory):
     session = simulate_session(load_plan(folder), TRUTH, seed=4, sigma=1e-6).session
     choice = Choice("offsets", prior=True)
     identified, _ = identify(session, choice, solver="variable-projection")
-    judged, recommended = Judgement((), AS_STATED), Recommendation("full", 1.0, (), 0.0)
+    judged, recommended = Judgement((), AS_STATED), Recommendation("full", 1.0, {}, 0.0)
     assessment = assess(identified, judgement=judged, recommendation=recommended)
     return replace(identified, assessment=assessment)
 
@@ -300,8 +300,8 @@ def test_the_assessment_states_the_tool_error_in_use(calibration, tmp_path):
     again = load_calibration(tmp_path / "calibration.json").assessment.tool
     assert again.use.unstated == tool.use.unstated
     text = " ".join(summarize(calibration).split())
-    assert "used from both sides, 15…35 °C, payload 0…4 kg." in text
-    assert "With the controller's present backlash: " in text
+    assert "approaches from both sides, 15…35 °C, payload 0…4 kg." in text
+    assert "With the backlash that the controller compensates now: " in text
     assert "Temperatures of 15…35 °C add" in text
     assert "A payload of 0…4 kg adds" in text
 

@@ -151,7 +151,7 @@ def must_change(drives: Sequence[str]) -> Finding:
 def not_significant(drives: Sequence[str]) -> Finding:
     """Finding about offsets that change by less than their uncertainty."""
     text = (
-        f"{_describe_change(drives, 'less')} Enter all offsets together or none: the tool error "
+        f"{_describe_change(drives, 'less')} Enter all offsets together: the tool error "
         "depends on all of them."
     )
     return note("not significant", text, "", parameter_places(*drives))
@@ -288,7 +288,7 @@ def describe_use(use: StatedUse) -> str:
     approach, temperature, payload = use["approach"], use["temperature"], use["payload"]
     if approach is not None:
         both = not approach.strip("u")
-        parts.append("used from both sides" if both else f"approach {approach}")
+        parts.append("approaches from both sides" if both else f"approach {approach}")
     if temperature is not None:
         parts.append(f"{_describe_range(temperature)} °C")
     if payload is not None:
@@ -335,8 +335,8 @@ def describe_without_backlash(rms: float) -> str:
         rms: RMS of that tool error, [m].
     """
     return (
-        f"With the controller's present backlash: {tool_mm(rms)}, unless all positions are "
-        "approached from one side."
+        f"With the backlash that the controller compensates now: {tool_mm(rms)}, unless all "
+        "positions are approached from one side."
     )
 
 

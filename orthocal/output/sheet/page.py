@@ -152,17 +152,19 @@ def _front(
         rows.append((str(m.number), m.setup, setup.sensor.describe(), *gauge, count, *program))
     normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
-        "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
+        "Warm the machine up. Home it once. Do not home it again until all readings are taken. If "
+        "you must, read the setup in which it happened again.",
         f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
-        f"differs by more than {_largest_difference(robot)}, a dimension or the direction of "
-        "counting is wrong: correct it in machine.yaml (`orthocal new DIRECTORY --again`) or in "
-        "the robot's YAML. From now on, drive to the numbers printed here, not by eye. Travel of "
+        f"differs by more than {_largest_difference(robot)}, the zero of the joint, a dimension or "
+        "the direction of counting is wrong. Correct the zero in the controller (LinuxCNC: "
+        "HOME_OFFSET), or the others in machine.yaml (`orthocal new DIRECTORY --again`). From now on, drive to the numbers printed here, not by eye. Travel of "
         f"the joints: {'; '.join(_travel(session))}.",
         f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
-        "Check each rod and each hinge for play. The calibration does not remove play.",
+        "Check each rod and each hinge for play that the dial shows, and remove it: the "
+        "calibration cannot correct it.",
     ]
     blanks = "".join(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
@@ -307,8 +309,8 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         target = " ".join(gauge.setup.sensor.place).strip()
     return (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
-        f"{opposite}. {contact}To check with a ruler: the contact point is at {place} mm from the "
-        "tool centre point of the machine at its mechanical zero.",
+        f"{opposite}. {contact}In coordinates, from the tool centre point of the machine at its "
+        f"mechanical zero, the contact point is at {place} mm.",
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "enter every reading of this setup with the opposite sign.",
     )
@@ -331,7 +333,7 @@ def _across(gauge: GaugePosition) -> str:
     if offset <= VISIBLE:
         return "the rod on its centre line"
     return (
-        f"the rod {offset / MM:.1f} mm off its centre line, towards "
+        f"the rod with its centre {offset / MM:.1f} mm off the centre line, towards "
         f"{name_direction(gauge.lateral_offset, cosine=ABOUT_ALONG)}"
     )
 
@@ -342,8 +344,8 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
         return set_dial(session, setup.name)
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
-        f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Tap the "
-        "stand: the hand must return to 0."
+        f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Push the "
+        "stand lightly and release it: the hand must return to 0 within one step."
     )
 
 

@@ -47,7 +47,7 @@ GLUE = "\u00a0"
 """Space at which no line ends."""
 
 COMMANDS = {
-    "back": "correct the reading before; `back 7` line 7, also after `drop 7`",
+    "back": "correct the last reading; `back 7` line 7, also after `drop 7`",
     "repeat": "read the last line once more, as another cycle; `repeat 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",

@@ -140,7 +140,7 @@ def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     across /= np.linalg.norm(across)
     # the plunger's line, through the rod as it was in the zero, from the rod's axis now
     aside = float((np.array([at_zero[0] - 0.125, 0.0, at_zero[2]]) - axis) @ across) / MM
-    found = re.search(r"touches the rod (\d+\.\d) mm off its centre line, towards", text)
+    found = re.search(r"with its centre (\d+\.\d) mm off the centre line, towards", text)
     assert float(found[1]) == pytest.approx(abs(aside), abs=ROUNDED_PLACE)
     assert abs(aside) > 1.0
 
