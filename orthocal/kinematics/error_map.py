@@ -83,11 +83,12 @@ class MachineGeometry:
 
     def at(self, points: NDArray[np.intp], count: int) -> MachineGeometry:
         """Geometry of some of `count` points: one row per point, or one row for all."""
-        placements, drive_errors = (
-            rows if len(rows) == 1 else rows[points // (count // len(rows))]
-            for rows in (self.placements, self.drive_errors)
-        )
-        return MachineGeometry(self.map, placements, drive_errors)
+
+        def choose(values: Array) -> Array:
+            rows = values.reshape(-1, values.shape[-1])
+            return rows if len(rows) == 1 else rows[points // (count // len(rows))]
+
+        return MachineGeometry(self.map, choose(self.placements), choose(self.drive_errors))
 
     def _combine(self, commands: Array) -> tuple[Array, Array]:
         """Commands of all machines, (S K, n_command), and drive errors, (S, n_drive_errors)."""
@@ -225,12 +226,17 @@ class ErrorMap:
             errors: Shape (..., n_errors), [SI].
             commands: Commands on which placements may depend; neutral conditions by default. One
                 command, shape (n_command,), applies to all machines. K commands, shape
-                (K, n_command), apply to each of S machines, which gives S K rows of placements.
+                (K, n_command), apply to each of S machines.
+
+        Returns:
+            Placements of each machine, shape (..., 12 n_moved). If they depend on conditions, K
+            commands give rows for each machine and each command, shape (S K, 12 n_moved).
         """
         values = np.asarray(errors, dtype=np.float64)
         drive_errors = values[..., self.drive_errors]
         if commands is not None and commands.ndim > 1 and self.placement_conditions:
-            placements = self.placements_under(values, commands)
+            machines = values.reshape(-1, values.shape[-1])
+            placements = self.placements_under(machines, commands)
             rows = placements.reshape(-1, placements.shape[-1])
             return MachineGeometry(self, rows, drive_errors)
         command = commands if commands is not None and commands.ndim == 1 else None
