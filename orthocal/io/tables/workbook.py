@@ -68,8 +68,10 @@ _PERCENT_FORMATS = {9, 10}
 _DATE_FORMATS = {*range(14, 23), *range(27, 37), *range(45, 48), *range(50, 59)}
 """Numbers of the built-in formats of percentages and dates (ECMA-376, part 1, 18.8.30)."""
 
-_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[[^\]]*\]|_.|\*.')
-"""Parts of a number format that are literal text or layout."""
+_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[(?!(?:h+|m+|s+)\])[^\]]*\]|_.|\*.', re.I)
+"""Parts of a number format that are literal text, colours or layout; not elapsed times as [h]."""
+_PLACEHOLDER = re.compile(r"[0#?]|General", re.I)
+"""Part of a number format that shows a digit or the number."""
 _THOUSANDS = re.compile(r"[0#?],+(?![0#?,])")
 _DATE_CODE = re.compile(r"[dmhys]", re.I)
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?")
@@ -99,7 +101,7 @@ class NumberFormat:
     kind: CellKind
     """`number`, `date` or `scaled number`."""
     unit: str = ""
-    """Text behind the number."""
+    """Literal text behind the number."""
 
 
 def read_workbook(content: bytes, *, where: str, sheet: str | None = None) -> list[Sheet]:
@@ -366,13 +368,27 @@ def parse_number_format(code: str) -> NumberFormat:
     """
     if len(code) > LONGEST_FORMAT:
         raise ValueError(f"a number format has more than {LONGEST_FORMAT} characters")
-    positive = code.split(";")[0]
-    bare = _LITERAL.sub("", positive)
+    bare = _LITERAL.sub(lambda literal: "\0" * len(literal[0]), code).partition(";")[0]
     if "%" in bare or _THOUSANDS.search(bare):
         return NumberFormat("scaled number")
     if _DATE_CODE.search(bare):
         return NumberFormat("date")
-    return NumberFormat("number", "".join(a + b for a, b in _LITERAL.findall(positive)).strip())
+    end = max((match.end() for match in _PLACEHOLDER.finditer(bare)), default=0)
+    behind = _LITERAL.findall(code[end : len(bare)])
+    return NumberFormat("number", "".join(quoted + escaped for quoted, escaped in behind).strip())
+
+
+def _entry(table: Sequence[_Entry], index: int, noun: str, where: str) -> _Entry:
+    """Entry of a table of the workbook, by its index in a cell.
+
+    Raises:
+        SessionError: If the table has no such entry.
+    """
+    if index >= len(table):
+        raise SessionError(
+            f"has the {noun} {index}, but the workbook has {len(table)}", where=where
+        )
+    return table[index]
 
 
 def _local_name(element: Any) -> str:  # noqa: ANN401 - lxml has no types
