@@ -91,7 +91,7 @@ class Sheet:
     formulas: int
     """Number of cells with a formula."""
     hidden: int
-    """Number of hidden rows."""
+    """Number of hidden rows that are not blank."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,11 +220,11 @@ class _Workbook:
                 if number <= line:
                     raise ValueError(f"row {number} follows row {line}")
                 line, column = number, -1
-                hidden += element.get("hidden") in ("1", "true")
                 row = make_row(line, cells)
                 cells = []
                 if row is not None:
                     rows.append(row)
+                    hidden += element.get("hidden") in ("1", "true")
                     count += len(row.cells)
                     if line > MOST_ROWS or count > MOST_CELLS:
                         limit = f"{MOST_ROWS} rows" if line > MOST_ROWS else f"{MOST_CELLS} cells"
