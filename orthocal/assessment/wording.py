@@ -11,7 +11,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place, Severity
 from orthocal.text import capitalised, uncapitalised
-from orthocal.units import MM, UM
+from orthocal.units import MM, UM, format_fixed
 
 MOST_ACTIONS = 3
 """Largest number of actions in the next step of a decision."""
@@ -110,24 +110,24 @@ def parameter_places(*names: str) -> tuple[Place, ...]:
 
 
 def mm(value: float) -> str:
-    """Length in mm with three decimals."""
+    """Length in mm with three decimals, or "unknown"."""
     return plain(value / MM)
 
 
 def plain(value: float, decimals: int = 3) -> str:
     """Number with fixed decimals, or "unknown"."""
-    return f"{value:.{decimals}f}" if math.isfinite(value) else "unknown"
+    return format_fixed(value, decimals) if math.isfinite(value) else "unknown"
 
 
 def signed(value: float, decimals: int = 3) -> str:
     """Number with its sign, or "unknown"."""
-    return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"
+    return format_fixed(value, decimals, sign=True) if math.isfinite(value) else "unknown"
 
 
 def um(value: float) -> str:
-    """Length in µm; one decimal below 20 µm."""
+    """Length in µm, with one decimal below 20 µm, or "unknown"."""
     size = value / UM
-    return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
+    return plain(size, 0 if abs(size) >= 20.0 else 1)
 
 
 def name_offsets(drives: Sequence[str], *, firmware: bool) -> str:
@@ -153,12 +153,14 @@ def joined(names: Sequence[str], word: str = "and") -> str:
 
 
 def tool_mm(value: float) -> str:
-    """Tool error in mm with two significant digits and at most three decimals.
+    """Tool error in mm with two significant digits and at most three decimals, or "unknown".
 
     Args:
         value: Length, [m].
     """
     size = value / MM
+    if not math.isfinite(size):
+        return "unknown"
     digits = 1 - math.floor(math.log10(size)) if size > 0.0 else 3
     return f"{size:.{min(max(digits, 0), 3)}f} mm"
 
