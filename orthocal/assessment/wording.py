@@ -52,19 +52,17 @@ reject = partial(_finding, "reject")
 def describe_actions(findings: Sequence[Finding]) -> str:
     """Actions of the findings that are not notes: one sentence, or a numbered list with places.
 
-    The list has at most MOST_ACTIONS lines, then the number of further findings.
+    The list has at most MOST_ACTIONS lines, then the number of findings with other actions.
     """
-    by_action: dict[str, Finding] = {}
+    by_action: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.severity != "note" and finding.action:
-            by_action.setdefault(finding.action, finding)
+            by_action.setdefault(finding.action, []).append(finding)
     if len(by_action) < 2:
         return next(iter(by_action), "")
-    lines = [
-        f"{i}. {_after_place(finding)}"
-        for i, finding in enumerate(list(by_action.values())[:MOST_ACTIONS], start=1)
-    ]
-    further = len(by_action) - len(lines)
+    groups = list(by_action.values())
+    lines = [f"{i}. {_after_place(g[0])}" for i, g in enumerate(groups[:MOST_ACTIONS], start=1)]
+    further = sum(map(len, groups[MOST_ACTIONS:]))
     remaining = [f"Then {counted(further, 'further finding')} above."] if further else []
     return "\n  ".join(["do the following.", *lines, *remaining])
 
@@ -132,9 +130,10 @@ def um(value: float) -> str:
 
 def name_offsets(drives: Sequence[str], *, firmware: bool) -> str:
     """Noun phrase for the offsets of drives; on a printer for its endstops."""
+    s = "" if len(drives) == 1 else "s"
     if not firmware:
-        return f"the offset of {joined(tuple(drives))}"
-    return f"the endstop of tower {joined([d.partition('_')[0] for d in drives])}"
+        return f"the offset{s} of {joined(tuple(drives))}"
+    return f"the endstop{s} of tower{s} {joined([d.partition('_')[0] for d in drives])}"
 
 
 def counted(count: int, noun: str) -> str:
@@ -175,6 +174,6 @@ def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
 
 def name_direction(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
     """Name of the world axis along a direction; otherwise the components of the unit vector."""
-    unit = direction / np.linalg.norm(direction)
+    unit = direction / (np.linalg.norm(direction) or 1.0)
     components = ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in unit)
     return axis_name(direction, cosine=cosine) or f"({components})"
