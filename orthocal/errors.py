@@ -7,6 +7,11 @@ from orthocal.text import printable
 LONGEST_MESSAGE = 2000
 """Largest number of characters of a message; the middle of longer ones is omitted."""
 
+LONGEST_PLACE = LONGEST_MESSAGE // 2
+"""Largest number of characters of the place in a message."""
+
+_OMITTED = " … "
+
 
 class OrthocalError(Exception):
     """Base of all errors of orthocal.
@@ -21,9 +26,10 @@ class OrthocalError(Exception):
     exit_code = 2
 
     def __init__(self, problem: str, *, where: str | None = None) -> None:
-        self.where = None if where is None else printable(where)
-        self.problem = _shorten(printable(problem))
-        super().__init__(self.problem if where is None else f"{self.where}: {self.problem}")
+        self.where = None if where is None else _shorten(printable(where), LONGEST_PLACE)
+        place = "" if self.where is None else f"{self.where}: "
+        self.problem = _shorten(printable(problem), LONGEST_MESSAGE - len(place))
+        super().__init__(place + self.problem)
 
     def __reduce__(self) -> tuple[object, ...]:
         # by its attributes: another process does not know the arguments of __init__
@@ -39,12 +45,10 @@ def _restore(
     return error
 
 
-def _shorten(problem: str) -> str:
-    """A message of limited length."""
-    half = LONGEST_MESSAGE // 2
-    if len(problem) <= LONGEST_MESSAGE:
-        return problem
-    return f"{problem[:half]} … {problem[-half:]}"
+def _shorten(text: str, longest: int) -> str:
+    """A text of limited length, without its middle if necessary."""
+    half = (longest - len(_OMITTED)) // 2
+    return text if len(text) <= longest else f"{text[:half]}{_OMITTED}{text[-half:]}"
 
 
 class OutputError(OrthocalError):
@@ -89,7 +93,7 @@ class ExportError(OrthocalError):
 
 
 class GcodeError(OrthocalError):
-    """A G-code program contains commands that cannot be corrected."""
+    """A G-code program is invalid, or contains commands that cannot be corrected."""
 
 
 class ClosureError(OrthocalError):
@@ -98,18 +102,19 @@ class ClosureError(OrthocalError):
     Attributes:
         posture: Name of the posture.
         reason: Predicate of the message, whose subject is the posture.
-        residual: Largest closure residual, [m], or None for a singular posture.
+        residual: Largest closure residual, rotations times characteristic length, [m]; None for
+            another cause, such as a singular posture or the travel of a drive.
     """
 
     def __init__(self, reason: str, *, posture: str, residual: float | None = None) -> None:
         self.posture = posture
-        self.reason = _shorten(printable(reason))
+        self.reason = _shorten(printable(reason), LONGEST_MESSAGE)
         self.residual = residual
         super().__init__(f"posture '{posture}' {reason}")
 
 
 class UnreachableError(OrthocalError):
-    """A point or a set of drive coordinates has no solution in the paper's closed forms."""
+    """The paper's closed forms have no solution: a displacement or a point is beyond a leg."""
 
 
 class NotIdentifiableError(OrthocalError):

@@ -80,8 +80,9 @@ def capitalised(text: str) -> str:
 
 
 def uncapitalised(text: str) -> str:
-    """A text with a small first letter."""
-    return text[:1].lower() + text[1:]
+    """A text with a small first letter, unless its first word has further capitals (LinuxCNC)."""
+    following = text.partition(" ")[0][1:]
+    return text[:1].lower() + text[1:] if following == following.lower() else text
 
 
 def shorten(text: str) -> str:

@@ -17,6 +17,23 @@ ERRORS = (
 )
 
 
+def test_messages_are_limited_with_their_places():
+    found = errors.OrthocalError("a" + 5000 * "x" + "b", where="file" + 3000 * "w" + ":3")
+    assert found.where.startswith("filew")
+    assert found.where.endswith("w:3")
+    assert str(found) == f"{found.where}: {found.problem}"
+    assert (found.problem[0], found.problem[-1]) == ("a", "b")
+    whole = errors.OrthocalError(errors.LONGEST_MESSAGE * "x")
+    assert whole.problem == errors.LONGEST_MESSAGE * "x"
+    for error in (
+        found,
+        errors.OrthocalError(5000 * "x"),
+        errors.ClosureError(5000 * "x", posture="p"),
+    ):
+        assert len(str(error)) <= errors.LONGEST_MESSAGE
+        assert str(error).count("…") <= 2
+
+
 @pytest.mark.parametrize("error", ERRORS, ids=lambda e: type(e).__name__)
 def test_an_error_is_the_same_elsewhere(error):
     found = pickle.loads(pickle.dumps(error))

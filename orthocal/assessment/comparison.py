@@ -149,7 +149,6 @@ def compare_models(
     gathered = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
-    models = require_names(models or (), argument="models")
     names, noises = _require_models(session, models), find_known_noises(session)
     if judgement is None:
         report("searching the readings for anomalies")
@@ -172,7 +171,7 @@ def compare_models(
     )
     if judgement.verdict == "enter":
         report("comparing the evidence for models and effects")
-        comparison = _recommend(comparison, session, models)
+        comparison = _recommend(comparison, session, names if models else ())
     if comparison.best is None or not others:
         return comparison
     best = comparison.best.calibration
@@ -182,10 +181,11 @@ def compare_models(
 
 def _require_models(session: Session, models: Sequence[str]) -> Sequence[str]:
     """Names of models, by default all of the robot; unknown ones raise a ParameterError."""
+    names = require_names(models or (), argument="models")
     parameters = session.robot.parameters
-    for name in models:
+    for name in names:
         parameters.select_model(name)
-    return models or parameters.models
+    return names or parameters.models
 
 
 def _recommend(comparison: Comparison, session: Session, models: Sequence[str]) -> Comparison:

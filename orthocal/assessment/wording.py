@@ -11,7 +11,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place, Severity
 from orthocal.text import capitalised, uncapitalised
-from orthocal.units import MM, UM
+from orthocal.units import MM, UM, format_fixed
 
 MOST_ACTIONS = 3
 """Largest number of actions in the next step of a decision."""
@@ -52,19 +52,17 @@ reject = partial(_finding, "reject")
 def describe_actions(findings: Sequence[Finding]) -> str:
     """Actions of the findings that are not notes: one sentence, or a numbered list with places.
 
-    The list has at most MOST_ACTIONS lines, then the number of further findings.
+    The list has at most MOST_ACTIONS lines, then the number of findings with other actions.
     """
-    by_action: dict[str, Finding] = {}
+    by_action: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.severity != "note" and finding.action:
-            by_action.setdefault(finding.action, finding)
+            by_action.setdefault(finding.action, []).append(finding)
     if len(by_action) < 2:
         return next(iter(by_action), "")
-    lines = [
-        f"{i}. {_after_place(finding)}"
-        for i, finding in enumerate(list(by_action.values())[:MOST_ACTIONS], start=1)
-    ]
-    further = len(by_action) - len(lines)
+    groups = list(by_action.values())
+    lines = [f"{i}. {_after_place(g[0])}" for i, g in enumerate(groups[:MOST_ACTIONS], start=1)]
+    further = sum(map(len, groups[MOST_ACTIONS:]))
     remaining = [f"Then {counted(further, 'further finding')} above."] if further else []
     return "\n  ".join(["do the following.", *lines, *remaining])
 
@@ -110,31 +108,32 @@ def parameter_places(*names: str) -> tuple[Place, ...]:
 
 
 def mm(value: float) -> str:
-    """Length in mm with three decimals."""
+    """Length in mm with three decimals, or "unknown"."""
     return plain(value / MM)
 
 
 def plain(value: float, decimals: int = 3) -> str:
     """Number with fixed decimals, or "unknown"."""
-    return f"{value:.{decimals}f}" if math.isfinite(value) else "unknown"
+    return format_fixed(value, decimals) if math.isfinite(value) else "unknown"
 
 
 def signed(value: float, decimals: int = 3) -> str:
     """Number with its sign, or "unknown"."""
-    return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"
+    return format_fixed(value, decimals, sign=True) if math.isfinite(value) else "unknown"
 
 
 def um(value: float) -> str:
-    """Length in µm; one decimal below 20 µm."""
+    """Length in µm, with one decimal below 20 µm, or "unknown"."""
     size = value / UM
     return plain(size, 0 if abs(size) >= 20.0 else 1)
 
 
 def name_offsets(drives: Sequence[str], *, firmware: bool) -> str:
     """Noun phrase for the offsets of drives; on a printer for its endstops."""
+    s = "" if len(drives) == 1 else "s"
     if not firmware:
-        return f"the offset of {joined(tuple(drives))}"
-    return f"the endstop of tower {joined([d.partition('_')[0] for d in drives])}"
+        return f"the offset{s} of {joined(tuple(drives))}"
+    return f"the endstop{s} of tower{s} {joined([d.partition('_')[0] for d in drives])}"
 
 
 def counted(count: int, noun: str) -> str:
@@ -158,12 +157,14 @@ def joined(names: Sequence[str], word: str = "and") -> str:
 
 
 def tool_mm(value: float) -> str:
-    """Tool error in mm with two significant digits and at most three decimals.
+    """Tool error in mm with two significant digits and at most three decimals, or "unknown".
 
     Args:
         value: Length, [m].
     """
     size = value / MM
+    if not math.isfinite(size):
+        return "unknown"
     digits = 1 - math.floor(math.log10(size)) if size > 0.0 else 3
     return f"{size:.{min(max(digits, 0), 3)}f} mm"
 
@@ -178,6 +179,6 @@ def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
 
 def name_direction(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
     """Name of the world axis along a direction; otherwise the components of the unit vector."""
-    unit = direction / np.linalg.norm(direction)
+    unit = direction / (np.linalg.norm(direction) or 1.0)
     components = ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in unit)
     return axis_name(direction, cosine=cosine) or f"({components})"

@@ -83,11 +83,12 @@ class MachineGeometry:
 
     def at(self, points: NDArray[np.intp], count: int) -> MachineGeometry:
         """Geometry of some of `count` points: one row per point, or one row for all."""
-        placements, drive_errors = (
-            rows if len(rows) == 1 else rows[points // (count // len(rows))]
-            for rows in (self.placements, self.drive_errors)
-        )
-        return MachineGeometry(self.map, placements, drive_errors)
+
+        def choose(values: Array) -> Array:
+            rows = values.reshape(-1, values.shape[-1])
+            return rows if len(rows) == 1 else rows[points // (count // len(rows))]
+
+        return MachineGeometry(self.map, choose(self.placements), choose(self.drive_errors))
 
     def _combine(self, commands: Array) -> tuple[Array, Array]:
         """Commands of all machines, (S K, n_command), and drive errors, (S, n_drive_errors)."""
@@ -144,8 +145,8 @@ class ErrorMap:
         neutral = neutral_values(robot)
         sizes = [condition_size(robot, c) for c in self.conditions]
         of_placements = np.repeat([c in self.placement_conditions for c in self.conditions], sizes)
-        drives = np.zeros(len(robot.drives), dtype=np.bool_)
-        self.of_placements = np.concatenate([drives, of_placements.astype(np.bool_)])
+        of_drives = np.zeros(len(robot.drives), dtype=np.bool_)
+        self.of_placements = np.concatenate([of_drives, of_placements.astype(np.bool_)])
         self._neutral = np.repeat([neutral[c] for c in self.conditions], sizes).astype(np.float64)
         of_condition = np.repeat(np.array(self.conditions, dtype=object), sizes)
         self._coordinates = len(robot.drives) + np.flatnonzero(of_condition == "coordinates")
@@ -178,7 +179,7 @@ class ErrorMap:
 
     @property
     def n_conditions(self) -> int:
-        """Count of the numbers in a command that are no drive coordinates."""
+        """Number of values of conditions in a command, after the drive coordinates."""
         return self._neutral.size
 
     def expand(self, values: Mapping[str, float]) -> Array:
@@ -225,12 +226,17 @@ class ErrorMap:
             errors: Shape (..., n_errors), [SI].
             commands: Commands on which placements may depend; neutral conditions by default. One
                 command, shape (n_command,), applies to all machines. K commands, shape
-                (K, n_command), apply to each of S machines, which gives S K rows of placements.
+                (K, n_command), apply to each of S machines.
+
+        Returns:
+            Placements of each machine, shape (..., 12 n_moved). If they depend on conditions, K
+            commands give rows for each machine and each command, shape (S K, 12 n_moved).
         """
         values = np.asarray(errors, dtype=np.float64)
         drive_errors = values[..., self.drive_errors]
         if commands is not None and commands.ndim > 1 and self.placement_conditions:
-            placements = self.placements_under(values, commands)
+            machines = values.reshape(-1, values.shape[-1])
+            placements = self.placements_under(machines, commands)
             rows = placements.reshape(-1, placements.shape[-1])
             return MachineGeometry(self, rows, drive_errors)
         command = commands if commands is not None and commands.ndim == 1 else None
@@ -332,7 +338,7 @@ class ErrorMap:
         errors: ArrayLike,
         unit_errors: Array,
         *,
-        command: Array | None = None,
+        commands: Array | None = None,
         right: Array | None = None,
     ) -> Array:
         """Derivatives of the moved placements with respect to parameters, ∂ξ = T ∂δ.
@@ -340,21 +346,21 @@ class ErrorMap:
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
             unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
-            command: Shape (n_command,) or (..., n_command); neutral conditions by default.
+            commands: Shape (n_command,) or (..., n_command); neutral conditions by default.
             right: `right_jacobians` of these errors; computed by default.
 
         Returns:
             Twists in the frames of the placements, shape (..., 6 n_moved, n), [m, rad].
         """
-        right = self.right_jacobians(errors, command) if right is None else right
+        right = self.right_jacobians(errors, commands) if right is None else right
         n = unit_errors.shape[1]
-        inner = self.twist_jacobian(errors, unit_errors, command)
+        inner = self.twist_jacobian(errors, unit_errors, commands)
         twists = right @ inner.reshape(*inner.shape[:-2], len(self.moved), 6, n)
         return twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)
 
-    def right_jacobians(self, errors: ArrayLike, command: Array | None = None) -> Array:
+    def right_jacobians(self, errors: ArrayLike, commands: Array | None = None) -> Array:
         """Right Jacobian T(δ) of every moved placement, shape (..., n_moved, 6, 6)."""
-        return right_jacobian(self._shaped(self.twists_of(errors, command)))
+        return right_jacobian(self._shaped(self.twists_of(errors, commands)))
 
     @property
     def nominal(self) -> Array:
@@ -372,23 +378,23 @@ class ErrorMap:
         return self._twists(np.asarray(errors, dtype=np.float64), self._conditions(commands))
 
     def twist_jacobian(
-        self, errors: ArrayLike, unit_errors: Array, command: Array | None = None
+        self, errors: ArrayLike, unit_errors: Array, commands: Array | None = None
     ) -> Array:
         """Derivatives of the twists δ of the moved placements with respect to parameters.
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
             unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
-            command: Shape (n_command,) or (..., n_command); neutral conditions by default.
+            commands: Shape (n_command,) or (..., n_command); neutral conditions by default.
 
         Returns:
             Shape (6 n_moved, n), [m, rad]; (..., 6 n_moved, n) if they depend on the errors.
         """
         values = np.asarray(errors, dtype=np.float64)
-        return self._twists.jacobian(values, unit_errors, self._conditions(command))
+        return self._twists.jacobian(values, unit_errors, self._conditions(commands))
 
     def twists_moved_by(self, unit_errors: Array) -> Mask:
-        """Mask of the twists that parameters change, shape (6 n_moved,).
+        """Mask of the components of twists that parameters change, shape (6 n_moved,).
 
         Args:
             unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
@@ -426,11 +432,11 @@ class VaryingDerivatives:
 class _Twists:
     """Twists as a function of conditions and errors, and their derivative.
 
-    Geometric errors are single linear terms of a twist and are assigned by index. General terms are
-    evaluated by CasADi.
+    Components with a single linear term, as of geometric errors, are assigned by index. General
+    terms are evaluated by CasADi.
 
     Attributes:
-        general: Indices of the twists with general terms, shape (n_general,).
+        general: Indices of the components of twists with general terms, shape (n_general,).
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -482,9 +488,9 @@ class _Twists:
         """Constant part and general part of ∂δ with respect to parameters.
 
         Returns:
-            The constant part, shape (n_twists, n); the Jacobian of the general terms with respect
-            to some errors, shape (..., n_general, n_some); and the values of these errors for one
-            unit of each parameter, shape (n_some, n).
+            The constant part, shape (n_components, n); the Jacobian of the general terms with
+            respect to some errors, shape (..., n_general, n_some); and the values of these errors
+            for one unit of each parameter, shape (n_some, n).
         """
         constant = np.zeros((self._n, unit_errors.shape[1]))
         constant[self._linear_twists] = self._slopes[:, None] * unit_errors[self._linear_errors]
@@ -495,7 +501,7 @@ class _Twists:
         return constant, self._evaluate(errors, conditions)[1], general_unit_errors
 
     def moved_by(self, errors: Mask) -> Mask:
-        """Mask of the twists that masked errors change, shape (n_twists,)."""
+        """Mask of the components of twists that masked errors change, shape (n_components,)."""
         result = np.zeros(self._n, dtype=np.bool_)
         result[self._of_twist[errors[self._of_error]]] = True
         return result
@@ -639,11 +645,12 @@ def _moved_placements(
     twists = ca.Function("twists", symbols, outputs)
     by_theta = ca.MX(ca.sparsify(ca.DM(unit_errors)))
     delta, by_errors = twists(conditions, ca.DM(fixed) + by_theta @ theta)
-    values, right = ca.MX(12, 0), ca.MX(27, 0)
+    sparsity = _right_jacobian_sparsity()
+    values, right = ca.MX(12, 0), ca.MX(sparsity.nnz(), 0)
     if chosen.size:
         mapped = _moved_placement().map(chosen.size)
         values, right = mapped(ca.reshape(delta, 6, -1), ca.DM(map_.nominal[chosen].T))
-    blocks = ca.diagcat(ca.Sparsity(0, 0), *[_right_jacobian_sparsity()] * chosen.size)
+    blocks = ca.diagcat(ca.Sparsity(0, 0), *[sparsity] * chosen.size)
     by_twists = ca.MX(blocks, ca.vec(right)) @ (by_errors @ by_theta)
     function = ca.Function(
         "error_map", [theta, conditions], [ca.densify(ca.vec(values)), by_twists.nz[:]]

@@ -113,7 +113,7 @@ class ToolSensitivity:
         """∂ξ/∂θ of the placements under the conditions of commands, (K, n_twists, n_free)."""
         errors = np.tile(self.closure.errors(), (len(commands), 1))
         return self._functions.errors.placement_jacobian(
-            errors, self._unit_errors, command=commands
+            errors, self._unit_errors, commands=commands
         )
 
     def _differentiate(self, commands: Array, passive: Array, placement_jacobian: Array) -> Array:

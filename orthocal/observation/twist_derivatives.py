@@ -138,7 +138,7 @@ class TwistChain:
         Rows of twists that vary with the conditions are 0.
         """
         jacobian = self._map.placement_jacobian(
-            self._errors, self._unit_errors, command=self._command, right=self._right
+            self._errors, self._unit_errors, commands=self._command, right=self._right
         )
         if self._varying is not None:
             jacobian[:, self._of_varying] = 0.0

@@ -15,6 +15,7 @@ from effect_plans import effect_plan
 from orthocal import (
     ExportOptions,
     calibrate,
+    draw_scene,
     export_calibration,
     simulate_session,
     validate_calibration,
@@ -30,10 +31,13 @@ from orthocal.assessment.controller_entries import (
     is_worth_changing,
 )
 from orthocal.assessment.recommendation import Recommendation
+from orthocal.assessment.tool_error import assess_tool
+from orthocal.assessment.wording import um
 from orthocal.cli.correct import _find_lags
 from orthocal.effects.compensation import JointTrim
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.output.scene import tool_errors
 from orthocal.output.text.answer import render_answer
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.validation import render_validation
@@ -145,6 +149,24 @@ def test_the_tool_error_is_that_with_the_entered_backlash(calibration):
         known = np.sqrt(space.weights @ (aligned**2).sum(axis=1))
         assert np.hypot(known, tool.compensated) == pytest.approx(expected, rel=1e-6)
     assert tool.without_backlash > 1.1 * tool.entered
+
+
+def test_the_scene_shows_the_largest_error_and_the_entered_backlash(calibration, monkeypatch):
+    """Under several sides of approach the mean of the errors is smaller than the largest."""
+    accuracy = assess_tool(calibration)
+    assert accuracy.use.size > 1
+    fields = (accuracy.deviation, accuracy.deviation_with_entries)
+    now, entered = (np.linalg.norm(accuracy.align(d), axis=1).max() * 1e6 for d in fields)
+    for changes in (True, False):  # with unchanged offsets, backlash is entered all the same
+        monkeypatch.setattr(tool_errors, "changes_offsets", lambda calibration, c=changes: c)
+        scene = draw_scene(calibration, show="tool")
+        texts = {e.nodes[0]: e.text for e in scene.legend}
+        assert f"up to {now:.0f} µm" in texts[tool_errors.TOOL_NOW]
+        assert "arrows: mean over the conditions" in texts[tool_errors.TOOL_NOW]
+        shown = texts[tool_errors.TOOL_ENTERED]
+        assert shown.startswith("Tool error with the values entered")
+        assert f"up to {um(entered * 1e-6)} µm" in shown
+        assert scene.headline.startswith(f"Tool error now: up to {now:.0f} µm")
 
 
 def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calibration):

@@ -98,6 +98,22 @@ def test_the_tool_is_that_of_the_independent_machine(folder, closure, errors):
         assert np.abs(inverse - drives).max() < 10 * KINEMATICS
 
 
+def test_one_machine_has_a_row_of_placements_for_each_command(closure, errors):
+    map_ = error_map(closure.robot)
+    values = map_.expand(errors)
+    commands = map_.command(points(closure)[0])
+    expected = [map_.placements(values, command) for command in commands]
+    geometry = map_.geometry(values, commands)
+    assert np.array_equal(geometry.placements, expected)
+    assert geometry.drives(commands).shape == (3, 3)
+    several = map_.geometry(np.array([values, 0.0 * values]), commands)
+    assert np.array_equal(several.placements[:3], expected)
+    assert several.drives(commands).shape == (2, 3, 3)
+    chosen = geometry.at(np.array([2, 0]), 3)
+    assert np.array_equal(chosen.placements, [expected[2], expected[0]])
+    assert chosen.drive_errors.shape == (1, map_.drive_errors.size)
+
+
 def test_sensitivities_are_central_differences(plan, errors, closure):
     drives, _ = points(closure)
     names = (*BOWS, "x_slide.offset", "y_slide.rz", "z_slide.y")

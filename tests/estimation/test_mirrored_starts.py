@@ -14,6 +14,7 @@ from planned import entered
 from tolerances import SAME_NUMBER
 
 from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -119,6 +120,17 @@ def test_a_ball_in_general_position_has_one_start(height, planes):
     ) as descend:
         VariableProjection(problem).solve(sigma=SIGMA)
     assert descend.call_count == 1
+
+
+def test_the_largest_number_of_iterations_applies_to_mirror_images():
+    problem = problem_of(circles(entered("biglide"), {"a": bar_at(0.0)}))
+    program = VariableProjection(problem, options=SolverOptions(max_iterations=25))
+    with patch.object(
+        VariableProjection, "_descend", autospec=True, side_effect=VariableProjection._descend
+    ) as descend:
+        program.solve(sigma=SIGMA)
+    assert descend.call_count > 1
+    assert {call.args[3] for call in descend.call_args_list} == {25}
 
 
 def test_a_shared_ball_is_mirrored_once():

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import pytest
 from calibrated import EXPERIMENT_2, UNJUDGED, calibrated
+from rich.text import Text
 
 from orthocal import calibrate, draw_errors, simulate_session, summarize
 from orthocal.assessment.fit_findings import describe_gauge
+from orthocal.output.text.summary import result_json
+from orthocal.planning.plan import MeasuringPlan
 
 pytestmark = pytest.mark.usefixtures("without_sensor_gains")
 
@@ -51,6 +54,23 @@ def test_details_list_the_values_to_enter_and_significant_changes(table1):
     (found,) = table1.assessment.of_kind("not significant")
     assert {p.parameter for p in found.places} == {"x_slide", "y_slide", "z_slide"}
     assert found.text in " ".join(text.split())
+
+
+def test_json_of_another_result_is_refused():
+    with pytest.raises(TypeError, match="found a str; expected a Calibration, a Validation"):
+        result_json("calibration.json")
+
+
+def test_all_rows_of_a_plan_include_its_details(monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        "orthocal.output.text.plan.render_plan",
+        lambda plan, *, details: shown.append(details) or Text(),
+    )
+    plan = object.__new__(MeasuringPlan)
+    for details, all_rows in ((False, False), (False, True), (True, False)):
+        summarize(plan, details=details, all_rows=all_rows)
+    assert shown == [False, True, True]
 
 
 def test_an_unstated_controller_is_noted():

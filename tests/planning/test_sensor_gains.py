@@ -85,7 +85,7 @@ def test_offsets_that_leg_readings_do_not_determine_are_named_with_the_best_sens
     calibration = calibrate(simulated, **UNJUDGED)
     for text in (answer, summarize(calibration)):
         words = " ".join(text.split())
-        sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
+        sentence = next(s for s in words.split(". ") if "do not determine the offsets of" in s)
         assert all(name in sentence for name in ("a_slide", "b_slide", "c_slide"))
         found = re.search(f"Another hour with {best.words} {number}", words)
         assert float(found[1]) == pytest.approx(1e3 * best.rms, rel=0.02)

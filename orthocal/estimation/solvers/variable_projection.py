@@ -1,16 +1,21 @@
-"""Variable projection: the exact identification by the Gauss-Newton method on θ alone.
+"""Variable projection: the exact identification by the Gauss-Newton method on θ̂ alone.
 
-Passive joints and gauge zeros are eliminated. About the present θ the problem is linear except for
-a robust loss. This subproblem is solved completely, within the bounds. The passive joints follow
-the step to first order. If the loops remain nearly closed and the objective decreases, their
-opening is corrected in the next step. Otherwise the loops are closed and the step is halved until
-the objective decreases. Steps are accelerated by Anderson's method (`_Acceleration`). The optimum
-is that of the complete program, which Ipopt solves.
+θ̂ are the free parameters in prior standard deviations. Passive joints and gauge zeros are functions
+of θ̂ and are eliminated (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 1973). About
+the present θ̂ the problem is linear except for a robust loss. This subproblem is solved completely,
+within the bounds. The passive joints follow the step to first order. If the loops remain nearly
+closed and the objective decreases, their opening is corrected in the next step. Otherwise the loops
+are closed and the step is halved until the objective decreases. Steps are accelerated by Anderson's
+method (`_Acceleration`). The optimum is that of the complete program, which Ipopt solves.
 
 From start values far from the optimum, the first steps can be so long that they end in a local
 minimum. If the result is far from its prior, or the solver does not converge, the problem is solved
 again. Readings then have lower weights first, which shortens the steps. The better optimum is
 returned.
+
+Some parameters change readings only to second order. Then a machine on the other side of a
+stationary point has almost the same readings and may be a better optimum: a mirror image
+(`mirrored_starts`). The solver starts from it again.
 """
 
 from __future__ import annotations
@@ -31,8 +36,9 @@ STEP_TOLERANCE = 1e-8
 steps, [prior std]."""
 
 MAX_CORRECTION = 1e-3
-"""Largest correction of a passive coordinate that readings follow to first order, [rad] or
-characteristic lengths: its square changes a reading by less than a micrometre."""
+"""Largest correction of a passive coordinate that readings follow to first order: an angle, [rad],
+or the ratio of a length to the characteristic length of the robot. Its square changes a reading by
+less than a micrometre."""
 
 RELAXATIONS = (16.0, 4.0, 1.0)
 """Factors on the standard deviation of the readings; each solution starts the next."""
@@ -54,9 +60,10 @@ OBJECTIVE_TOLERANCE = 1e-12
 
 
 class VariableProjection(Program):
-    """Calibration problem that is reduced to its free parameters.
+    """Solver of a calibration problem in its free parameters alone.
 
-    Its options are `max_iterations` and `loss`.
+    Of its options it uses `max_iterations` for each descent, and `loss`. Solutions state the number
+    of iterations without those of descents that failed.
     """
 
     kind = "variable-projection"
@@ -68,14 +75,13 @@ class VariableProjection(Program):
         if not (data.mirrored and len(directions)):
             return best
         iterations, passive = best.iterations, best.passive
+        most = min(MAX_MIRRORED_ITERATIONS, self.options.max_iterations)
         starts = self.problem.mirrored_starts(best.theta[None], passive[None], directions)
         for start in starts[:, 0]:
             image = replace(data, start=start, start_passive=passive)
             task = Task(self.problem, self.options.loss, image)
             try:
-                state, jacobian, count = self._descend(
-                    task, task.begin(), MAX_MIRRORED_ITERATIONS, follow=True
-                )
+                state, jacobian, count = self._descend(task, task.begin(), most, open_loops=True)
             except (ClosureError, SolverError):
                 continue
             iterations += count
@@ -127,9 +133,9 @@ class VariableProjection(Program):
         most = self.options.max_iterations
         start = task.begin()
         try:
-            state, jacobian, iterations = self._descend(task, start, most, follow=True)
+            state, jacobian, iterations = self._descend(task, start, most, open_loops=True)
         except (ClosureError, SolverError):
-            state, jacobian, iterations = self._descend(task, task.begin(), most, follow=False)
+            state, jacobian, iterations = self._descend(task, task.begin(), most, open_loops=False)
         return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 
     def _descend(
@@ -138,7 +144,7 @@ class VariableProjection(Program):
         begin: tuple[Iterate, ReadingLinearisation],
         max_iterations: int,
         *,
-        follow: bool,
+        open_loops: bool,
     ) -> tuple[Iterate, Array, int]:
         """Gauss-Newton iterations: the optimum, the last Jacobian and the number of iterations.
 
@@ -146,7 +152,7 @@ class VariableProjection(Program):
             task: The task.
             begin: The start, with closed loops.
             max_iterations: Largest number of iterations.
-            follow: Let passive joints follow a step to first order.
+            open_loops: Accept steps after which the loops are closed to first order only.
 
         Raises:
             SolverError: If the solver does not converge.
@@ -160,21 +166,23 @@ class VariableProjection(Program):
             step = task.step(state, jacobian)
             sizes = np.r_[np.abs(step).max(initial=0.0), sizes[:2]]
             accelerated = acceleration.accelerate(state.theta, step)
-            if follow and have_converged(sizes):
+            if open_loops and have_converged(sizes):
                 theta = np.clip(state.theta + accelerated, task.low, task.high)
                 passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
             trials = [step] if accelerated is step else [accelerated, step]
-            followed = None
-            for trial in trials if follow else []:
-                followed = followed or self._follow(task, state, linear, trial)
-            if followed is not None:
-                state, linear = followed
+            reached = None
+            for trial in trials if open_loops else []:
+                reached = self._move_open(task, state, linear, trial)
+                if reached is not None:
+                    break
+            if reached is not None:
+                state, linear = reached
                 continue
-            state, step = self._move(task, state, step)
-            sizes[0] = np.abs(step).max(initial=0.0)
-            if have_converged(sizes):
-                return state, jacobian, iterations
+            closed = self._move_closed(task, state, step, iterations=iterations)
+            if closed is None or have_converged(sizes):
+                return closed or state, jacobian, iterations
+            state = closed
             linear = task.linearise(state.theta, state.passive)
         raise SolverError(
             f"did not converge: the step is still {sizes[0]:.2g} prior standard deviations "
@@ -183,7 +191,7 @@ class VariableProjection(Program):
             iterations=max_iterations,
         )
 
-    def _follow(
+    def _move_open(
         self, task: Task, state: Iterate, linear: ReadingLinearisation, step: Array
     ) -> tuple[Iterate, ReadingLinearisation] | None:
         """State after a full step with open loops; None if they open too far or it is worse."""
@@ -202,27 +210,37 @@ class VariableProjection(Program):
         trial = task.near(theta, passive, linear)
         return (trial, linear) if _is_not_worse(trial, state) else None
 
-    def _move(self, task: Task, state: Iterate, step: Array) -> tuple[Iterate, Array]:
-        """Halve a step until the objective decreases, with closed loops.
+    def _move_closed(
+        self, task: Task, state: Iterate, step: Array, *, iterations: int
+    ) -> Iterate | None:
+        """State with closed loops after a step that is halved until the objective decreases.
+
+        None if even a negligible part of the step is worse: only rounding errors remain.
 
         Raises:
-            SolverError: If it does not decrease.
+            SolverError: If no part of the step decreases it.
+            ClosureError: If the machine cannot reach a posture after any part of the step.
         """
+        unreachable, reached = None, False
         for halving in range(MAX_HALVINGS):
             part = step * 0.5**halving
             try:
                 trial = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
-            except ClosureError:  # out of reach: a shorter step
+            except ClosureError as e:  # a shorter step may be possible
+                unreachable = e
                 continue
+            reached = True
             if _is_not_worse(trial, state):
-                return trial, part
+                return trial
             if np.abs(part).max(initial=0.0) < STEP_TOLERANCE:
-                return state, np.zeros_like(step)
+                return None
+        if unreachable is not None and not reached:
+            raise unreachable
         raise SolverError(
             "did not converge: no step improves the fit; there is no result. "
             f"{advise(self.options)}",
             status="Restoration_Failed",
-            iterations=MAX_HALVINGS,
+            iterations=iterations,
         )
 
 

@@ -13,11 +13,10 @@ import math
 import posixpath
 import re
 import zipfile
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any
+from typing import Any, TypeVar
 
 from lxml import etree
 
@@ -47,10 +46,14 @@ MOST_PARTS = 2_000
 """Maximum number of parts of a workbook."""
 
 MOST_TAGS = 5 * MOST_CELLS
-"""Maximum number of XML tags of a part; a cell has four, with a formula six."""
+"""Maximum number of XML tags of a part: five for each cell. A cell has four, with a formula six."""
 
 LONGEST_FORMAT = 255
 """Maximum length of a number format, as in Excel."""
+
+MS_PER_DAY = 86_400_000
+
+_Entry = TypeVar("_Entry")
 
 _SAFE = {
     "resolve_entities": False,
@@ -68,8 +71,10 @@ _PERCENT_FORMATS = {9, 10}
 _DATE_FORMATS = {*range(14, 23), *range(27, 37), *range(45, 48), *range(50, 59)}
 """Numbers of the built-in formats of percentages and dates (ECMA-376, part 1, 18.8.30)."""
 
-_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[[^\]]*\]|_.|\*.')
-"""Parts of a number format that are literal text or layout."""
+_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[(?!(?:h+|m+|s+)\])[^\]]*\]|_.|\*.', re.I)
+"""Parts of a number format that are literal text, colours or layout; not elapsed times as [h]."""
+_PLACEHOLDER = re.compile(r"[0#?]|General", re.I)
+"""Part of a number format that shows a digit or the number."""
 _THOUSANDS = re.compile(r"[0#?],+(?![0#?,])")
 _DATE_CODE = re.compile(r"[dmhys]", re.I)
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?")
@@ -89,7 +94,7 @@ class Sheet:
     formulas: int
     """Number of cells with a formula."""
     hidden: int
-    """Number of hidden rows."""
+    """Number of hidden rows that are not blank."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +104,7 @@ class NumberFormat:
     kind: CellKind
     """`number`, `date` or `scaled number`."""
     unit: str = ""
-    """Text behind the number."""
+    """Literal text behind the number."""
 
 
 def read_workbook(content: bytes, *, where: str, sheet: str | None = None) -> list[Sheet]:
@@ -172,7 +177,7 @@ class _Workbook:
         self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
 
     def read(self, name: str | None) -> list[Sheet]:
-        """Read the visible sheets, or the sheet with a name."""
+        """Read the visible sheets, all sheets if none is visible, or the sheet with a name."""
         if not self._sheets:
             raise SessionError("is a workbook without worksheets", where=self._where)
         chosen = [s for s in self._sheets if s[1]] or self._sheets
@@ -218,11 +223,11 @@ class _Workbook:
                 if number <= line:
                     raise ValueError(f"row {number} follows row {line}")
                 line, column = number, -1
-                hidden += element.get("hidden") in ("1", "true")
                 row = make_row(line, cells)
                 cells = []
                 if row is not None:
                     rows.append(row)
+                    hidden += element.get("hidden") in ("1", "true")
                     count += len(row.cells)
                     if line > MOST_ROWS or count > MOST_CELLS:
                         limit = f"{MOST_ROWS} rows" if line > MOST_ROWS else f"{MOST_CELLS} cells"
@@ -244,7 +249,7 @@ class _Workbook:
         """
         if not children:
             return BLANK
-        kind = element.get("t", "n")
+        kind, place = element.get("t", "n"), f"{where} {element.get('r', '')}".rstrip()
         if kind not in ("n", "b", "d", "e", "s", "str", "inlineStr"):
             raise ValueError(f"'{shorten(kind)}' is not the type of a cell")
         text = _join_text(element) if kind == "inlineStr" else ""
@@ -253,32 +258,49 @@ class _Workbook:
         if not text:
             return Cell("", kind="unsaved formula") if "f" in children else BLANK
         if kind == "n":
-            return self._read_number(text, _parse_index(element.get("s", "0")))
+            if not self._formats:
+                return self._read_number(text, NumberFormat("number"))
+            style = _parse_index(element.get("s", "0"))
+            return self._read_number(text, _entry(self._formats, style, "style", place))
         if kind == "b":
             return Cell("TRUE" if text in ("1", "true") else "FALSE", kind="boolean")
         if kind == "d":
             return Cell(text, kind="date")
         if kind == "s":
-            text = self._strings[_parse_index(text)]
+            text = _entry(self._strings, _parse_index(text), "shared text", place)
         problem = text_problem(text.replace("\r", "\n"))
         if problem:
             raise SessionError(problem, where=where)
         return Cell(text)
 
-    def _read_number(self, text: str, style: int) -> Cell:
-        """Number rounded to the 15 digits of a spreadsheet program, or a date."""
+    def _read_number(self, text: str, number_format: NumberFormat) -> Cell:
+        """Number rounded to the 15 digits of a spreadsheet program, date or time of day.
+
+        Numbers beyond the calendar are no dates. Text that is no plain number remains text.
+        """
         value = math.nan
         if len(text) <= LONGEST_NUMBER and _NUMBER.fullmatch(text):
             value = float(text)
         if not abs(value) <= 1e15:
             return Cell(text)
-        form = self._formats[style] if self._formats else NumberFormat("number")
-        if form.kind == "date":
-            with suppress(OverflowError):  # a number beyond the calendar remains a number
-                text = str(self._epoch + datetime.timedelta(days=value))
-            return Cell(text, kind="date")
+        kind = number_format.kind
+        if kind == "date":
+            try:
+                return Cell(self._describe_date(value), kind="date")
+            except OverflowError:
+                kind = "number"
         number = Decimal(f"{value:.15g}")
-        return Cell(format_decimal(number), number, form.kind, form.unit)
+        return Cell(format_decimal(number), number, kind, number_format.unit)
+
+    def _describe_date(self, days: float) -> str:
+        """Date and time, to a millisecond, of days since the epoch; below one day only the time.
+
+        Raises:
+            OverflowError: If the date is beyond the calendar.
+        """
+        # the binary number of days is exact to microseconds only
+        date = self._epoch + datetime.timedelta(milliseconds=round(days * MS_PER_DAY))
+        return str(date.time() if 0.0 <= days < 1.0 else date)
 
     def _relations(self, part: str) -> dict[str, tuple[str, str]]:
         """Kinds and targets of the relations of a part, by identifier."""
@@ -366,13 +388,27 @@ def parse_number_format(code: str) -> NumberFormat:
     """
     if len(code) > LONGEST_FORMAT:
         raise ValueError(f"a number format has more than {LONGEST_FORMAT} characters")
-    positive = code.split(";")[0]
-    bare = _LITERAL.sub("", positive)
+    bare = _LITERAL.sub(lambda literal: "\0" * len(literal[0]), code).partition(";")[0]
     if "%" in bare or _THOUSANDS.search(bare):
         return NumberFormat("scaled number")
     if _DATE_CODE.search(bare):
         return NumberFormat("date")
-    return NumberFormat("number", "".join(a + b for a, b in _LITERAL.findall(positive)).strip())
+    end = max((match.end() for match in _PLACEHOLDER.finditer(bare)), default=0)
+    behind = _LITERAL.findall(code[end : len(bare)])
+    return NumberFormat("number", "".join(quoted + escaped for quoted, escaped in behind).strip())
+
+
+def _entry(table: Sequence[_Entry], index: int, noun: str, where: str) -> _Entry:
+    """Entry of a table of the workbook, by its index in a cell.
+
+    Raises:
+        SessionError: If the table has no such entry.
+    """
+    if index >= len(table):
+        raise SessionError(
+            f"has the {noun} {index}, but the workbook has {len(table)}", where=where
+        )
+    return table[index]
 
 
 def _local_name(element: Any) -> str:  # noqa: ANN401 - lxml has no types

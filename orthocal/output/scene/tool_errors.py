@@ -1,4 +1,4 @@
-"""Tool errors in a scene: now, with the offsets entered, and their uncertainty."""
+"""Tool errors in a scene: now, with the values entered, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from orthocal.viewer.scene import LegendEntry, Scene, round_scale
 from orthocal.viewer.shapes import Colour, css, draw_arrow, material, pose_along
 
 TOOL_NOW = "Tool error now"
-TOOL_ENTERED = "Tool error, offsets entered"
+TOOL_ENTERED = "Tool error, values entered"
 TOOL_UNCERTAINTY = "Tool error, uncertainty"
 
 NOW_COLOUR: Colour = (0.78, 0.12, 0.42)
@@ -35,7 +35,9 @@ NEGLIGIBLE = 1e-7
 
 
 def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: bool) -> str:
-    """Draw tool errors, now and with the offsets entered, and their uncertainty.
+    """Draw tool errors, now and with the values entered, and their uncertainty.
+
+    Arrows are means over the conditions of use. Texts state the largest error under any of them.
 
     Args:
         drawing: The scene of the machine.
@@ -51,14 +53,13 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     try:
         accuracy = assess_tool(calibration)
     except (ClosureError, RobotError) as e:
-        scene.facts.append(f"Tool errors are not shown. {e}.")
+        scene.facts.append(f"Tool errors are not shown: {e}.")
         return ""
     region = accuracy.workspace.words.removeprefix("the workspace ")
-    now, entered = (
-        accuracy.average(accuracy.align(d))
-        for d in (accuracy.deviation, accuracy.deviation_with_entries)
-    )
+    fields = (accuracy.deviation, accuracy.deviation_with_entries)
+    now, entered = (accuracy.align(d) for d in fields)
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
+    now, entered = (accuracy.average(d) for d in (now, entered))
     # uncertainty as in all tables: RMS in space, longer than the axes of its ellipsoid
     calibrated, scale_factor = accuracy.after, calibration.tolerance_scale.factor
     uncertainty = 0.0 if calibrated is None else calibrated.sizes.reported.largest
@@ -68,13 +69,15 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     chosen = _choose_points(accuracy)
     scene.tool_scale = round_scale(LONGEST_ARROW * drawing.size / largest)
     scale, targets = f"× {scene.tool_scale:g}", accuracy.targets[chosen]
+    averaged = "; arrows: mean over the conditions" if accuracy.use.size > 1 else ""
     width = ARROW_WIDTH * drawing.size
     _draw_deviations(scene, TOOL_NOW, targets, now[chosen], NOW_COLOUR, width)
-    text = f"Tool error now, {region}, aligned: up to {um(now_largest)} µm ({scale})"
+    text = f"Tool error now, {region}, aligned: up to {um(now_largest)} µm{averaged} ({scale})"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
-    if changes_offsets(calibration):
+    if changes_offsets(calibration) or accuracy.deviation_without_backlash is not None:
         _draw_deviations(scene, TOOL_ENTERED, targets, entered[chosen], ENTERED_COLOUR, width)
-        text = f"Tool error, offsets entered: up to {um(entered_largest)} µm ({scale})"
+        size = f"up to {um(entered_largest)} µm{averaged}"
+        text = f"Tool error with the values entered: {size} ({scale})"
         scene.explain(LegendEntry(text, (TOOL_ENTERED,), css(ENTERED_COLOUR), "arrow", shown))
     headline = f"Tool error now: up to {um(now_largest)} µm over {region}, workpiece aligned."
     if calibrated is not None:
@@ -89,7 +92,7 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
 
 
 def _largest(deviations: Array) -> float:
-    """Largest length of deviations of shape (K, 3), [m]."""
+    """Largest length of deviations of shape (n, 3), [m]."""
     return float(np.linalg.norm(deviations, axis=1).max())
 
 

@@ -55,7 +55,7 @@ def render_result(
     Args:
         result: The result.
         details: Whether to describe a result completely, not by the short answer.
-        all_rows: Whether to list every reading and parameter.
+        all_rows: Whether to list every reading and parameter; includes the details.
         saved: Directory in which a calibration was written.
     """
     if isinstance(result, Calibration):
@@ -75,7 +75,7 @@ def render_result(
     if isinstance(result, MeasuringPlan):
         from orthocal.output.text.plan import render_plan
 
-        return render_plan(result, details=details)
+        return render_plan(result, details=details or all_rows)
     if isinstance(result, Comparison):
         from orthocal.output.text.comparison import render_comparison
 
@@ -118,13 +118,23 @@ def result_json(result: Calibration | Validation | Comparison | Assessment) -> s
     """A result as JSON, with `decision` and `findings` at the top level.
 
     The JSON of a calibration loads like calibration.json.
+
+    Raises:
+        TypeError: If the result is of another kind.
     """
     if isinstance(result, Calibration):
         from orthocal.calibration.file import calibration_document
 
         document = calibration_document(result)
+    elif isinstance(result, Assessment):
+        document = {}
     else:
-        document = {} if isinstance(result, Assessment) else json.loads(result.to_json())
+        from orthocal.assessment.comparison import Comparison
+        from orthocal.assessment.validation import Validation
+
+        expected = "a Calibration, a Validation, a Comparison or an Assessment"
+        require_kind(result, (Validation, Comparison), expected=expected)
+        document = json.loads(result.to_json())
     document |= assessment_in(result).to_document()
     return format_json(document)
 

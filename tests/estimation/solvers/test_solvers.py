@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from gauges import exact
 
 from orthocal import load_calibration, load_session
 from orthocal.calibration.file import calibration_json
-from orthocal.errors import OrthocalError, SolverError
+from orthocal.errors import ClosureError, OrthocalError, SolverError
 from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
     SIX_ROWS,
@@ -243,3 +244,49 @@ def test_acceleration_ends_linear_iterations_after_as_many_steps_as_parameters()
         step = (1.0 - ratios) * (optimum - theta)
         theta = theta + acceleration.accelerate(theta, step)
     assert theta == pytest.approx(optimum, abs=1e-9)
+
+
+class LineTask:
+    """Stub of a task with one parameter: prescribed steps, and an objective with closed loops."""
+
+    sigma, low, high = 1.0, np.array([-10.0]), np.array([10.0])
+
+    def __init__(self, steps, objective, *, farthest=np.inf):
+        self.steps, self.objective, self.farthest = iter(steps), objective, farthest
+
+    def step(self, state, jacobian):
+        return np.array([next(self.steps)])
+
+    def at(self, theta, passive):
+        if theta[0] > self.farthest:
+            raise ClosureError("is out of reach", posture="far")
+        return SimpleNamespace(theta=theta, passive=None, objective=self.objective(theta[0]))
+
+    def linearise(self, theta, passive):
+        return SimpleNamespace(jacobian=np.ones((1, 1)))
+
+    def descend(self):
+        """Descend from 0 with closed loops."""
+        program = object.__new__(VariableProjection)
+        program.options = SolverOptions(solver="variable-projection")
+        begin = self.at(np.zeros(1), None), self.linearise(None, None)
+        return program._descend(self, begin, 50, open_loops=False)
+
+
+def test_a_halved_step_is_no_convergence():
+    """At 1 the step is still 0.2, but only a part of 1/2048 of it improves the fit."""
+    task = LineTask([1.0, 0.2, 0.2], lambda x: 10.0 - x if x <= 1.0 + 1.2e-4 else 100.0)
+    with pytest.raises(SolverError, match="no step improves the fit") as raised:
+        task.descend()
+    assert raised.value.iterations == 3
+    optimum, _, iterations = LineTask([1.0, 1e-9], lambda x: (1.0 + 1e-9 - x) ** 2).descend()
+    assert (optimum.theta[0], iterations) == (pytest.approx(1.0, abs=1e-12, rel=1e-8), 2)
+
+
+def test_a_posture_that_no_step_reaches_is_named():
+    task = LineTask([1.0], lambda x: -x, farthest=0.0)
+    with pytest.raises(ClosureError, match="posture 'far' is out of reach"):
+        task.descend()
+    task = LineTask([1.0], abs, farthest=0.5)  # shorter steps are possible, but worse
+    with pytest.raises(SolverError, match="no step improves the fit"):
+        task.descend()

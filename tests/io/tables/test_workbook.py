@@ -326,8 +326,40 @@ def test_numbers_have_the_digits_that_a_spreadsheet_shows():
 
 
 def test_hidden_rows_are_counted():
-    sheet = read_one(with_sheet(f'<row r="1" hidden="1">{CELL}</row><row r="2" hidden="0"/>'))
+    rows = f'<row r="1" hidden="1">{CELL}</row><row r="2" hidden="0"/><row r="3" hidden="1"/>'
+    sheet = read_one(with_sheet(rows))
     assert (len(sheet.rows), sheet.hidden) == (1, 1)
+
+
+def test_times_and_dates():
+    """Days as Excel saves them: 14:59.999997 minutes are 15, and a time of day has no date."""
+    made = openpyxl.Workbook()
+    days = (45000.4270833333, 45000.0, 0.4270833333, 0.0, 45000.5 + 0.25 / 86400.0, 1e12)
+    made.active.append(days)
+    for cell in made.active[1]:
+        cell.number_format = "yyyy-mm-dd hh:mm:ss"
+    (row,) = read_one(saved(made)).rows
+    assert [(c.text, c.kind) for c in row.cells] == [
+        ("2023-03-15 10:15:00", "date"),
+        ("2023-03-15 00:00:00", "date"),
+        ("10:15:00", "date"),
+        ("00:00:00", "date"),
+        ("2023-03-15 12:00:00.250000", "date"),
+        ("1000000000000", "number"),  # beyond the calendar
+    ]
+    assert row.cells[-1].number == Decimal(10**12)
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        ('<c r="B2" s="7"><v>1</v></c>', "has the style 7, but the workbook has "),
+        ('<c r="B2" t="s"><v>3</v></c>', "has the shared text 3, but the workbook has 0"),
+    ],
+)
+def test_cells_with_an_index_beyond_its_table_are_named(cell, message):
+    found = refusal(with_sheet(f'<row r="2">{cell}</row>'))
+    assert found.startswith(f"a.xlsx: sheet 'Sheet' B2: {message}")
 
 
 @pytest.mark.parametrize(
@@ -344,6 +376,14 @@ def test_hidden_rows_are_counted():
         ("dd/mm/yy", ("1900-01-11 12:00:00", "date", "")),
         ("mm-dd-yy", ("1900-01-11 12:00:00", "date", "")),
         ("[h]:mm", ("1900-01-11 12:00:00", "date", "")),
+        *((form, ("1900-01-11 12:00:00", "date", "")) for form in ("[h]", "[mm]", "[S]")),
+        ("[Red]0.0", ("12.5", "number", "")),
+        ("\\+0.000", ("12.5", "number", "")),
+        ('"R "0.0" mm"', ("12.5", "number", "mm")),
+        ('"R "General" mm"', ("12.5", "number", "mm")),
+        ('0.0" mm;"', ("12.5", "number", "mm;")),
+        ('0.0" a;b";0%', ("12.5", "number", "a;b")),
+        ("0.0\\;", ("12.5", "number", ";")),
         ("General", ("12.5", "number", "")),
     ],
 )
