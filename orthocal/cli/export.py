@@ -75,8 +75,6 @@ def export(
             for drives with backlash. Default: + for all joints.
         ini (FILE): linuxcnc: INI file during the measurement: HOME_OFFSET, latching, soft limits.
     """
-    from orthocal.export.formats import note_wrong_order
-
     result = orthocal.load_calibration(calibration)
     stated = {"--home-offset": home_offset, "--latched": latched}
     joints = None if ini is None else _read_joints(ini, result, stated)
@@ -98,8 +96,7 @@ def export(
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
-        put_note(note_wrong_order(result))
-        _note_latching(result, options, ini, module="kinematics.ini" in files)
+        _note_assumptions(result, options, ini, module="kinematics.ini" in files)
     if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
 
@@ -126,16 +123,18 @@ def _show_settings(
             put_out(printable(describe_next(fit, saved, out), keep="\n"))
 
 
-def _note_latching(
+def _note_assumptions(
     calibration: orthocal.Calibration,
     options: orthocal.ExportOptions,
     ini: Path | None,
     *,
     module: bool,
 ) -> None:
-    """Note the assumed directions in which homing latches the switches."""
+    """Note the assumed order of sessions, and directions in which homing latches the switches."""
+    from orthocal.export.formats import note_wrong_order
     from orthocal.export.linuxcnc.export import assumes_latching
 
+    put_note(note_wrong_order(calibration))
     if assumes_latching(calibration, options):
         unstated = "" if ini is None else f" ({ini} does not state it for every joint)"
         put_note(

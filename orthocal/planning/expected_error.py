@@ -397,8 +397,7 @@ class CriterionWeight:
         if self._criterion == "A":
             size = self._field.shape[2]
             return np.asarray(np.eye(size)[:, : self._n] / np.sqrt(self._n))
-        flat = np.sqrt(self._weights)[:, None, None] * self._field
-        return _root(flat.reshape(-1, flat.shape[2]))
+        return _root(self._field, self._weights)
 
     def _worst(self, covariance: Array) -> Array:
         """R of the power mean of the points' variances, shape (n_state, p)."""
@@ -406,12 +405,17 @@ class CriterionWeight:
         share = (variance / variance.max()) ** (WORST_POWER - 1.0)
         total = float(np.mean(share * variance / variance.max()))
         weights = share * total ** (1.0 / WORST_POWER - 1.0) / len(share)
-        flat = np.sqrt(weights)[:, None, None] * self._field
-        return _root(flat.reshape(-1, flat.shape[2]))
+        return _root(self._field, weights)
 
 
-def _root(rows: Array) -> Array:
-    """R with R Rᵀ = rowsᵀ rows and the smallest number of columns, shape (n, p)."""
+def _root(field: Array, weights: Array) -> Array:
+    """R with R Rᵀ = Σ w fᵀ f and the smallest number of columns, shape (n, p).
+
+    Args:
+        field: Jacobian f of each point, shape (K, 3, n).
+        weights: Weights w of the points, shape (K,).
+    """
+    rows = (np.sqrt(weights)[:, None, None] * field).reshape(-1, field.shape[2])
     values, vectors = np.linalg.eigh(rows.T @ rows)
     positive = values > values[-1] * 1e-14
     return np.asarray(vectors[:, positive] * np.sqrt(values[positive]))

@@ -571,11 +571,8 @@ def _simplify(
             new = PlannedSetup(which, tuple(rows[p] for p in postures))
             if not setups[which].reachable[new.chosen[0], list(new.chosen)].all():
                 continue
-            information = others + search.information_of(new)
-            error = search.error_of(information)
-            changed_setups = (*planned.setups[:k], new, *planned.setups[k + 1 :])
-            changed = PlannedSetups(changed_setups, information, error)
-            if error <= max_error and (_is_reached(changed, of_approach) or not reached):
+            changed = search.exchanged(planned, k, new, others)
+            if changed.error <= max_error and (_is_reached(changed, of_approach) or not reached):
                 planned = changed
                 break
     return planned

@@ -316,12 +316,25 @@ class SetupSearch:
         for new, rough_error in gains.refine([old], restarted=ranked):
             if new == old or rough_error > best.error * (1.0 + ROUNDING_ERROR):
                 continue
-            information = others + self.information_of(new)
-            error = self.error_of(information)
-            if is_less(error, best.error):
-                setups = (*plan.setups[:k], new, *plan.setups[k + 1 :])
-                best = PlannedSetups(setups, information, error)
+            exchanged = self.exchanged(plan, k, new, others)
+            if is_less(exchanged.error, best.error):
+                best = exchanged
         return best
+
+    def exchanged(
+        self, plan: PlannedSetups, k: int, new: PlannedSetup, others: Array
+    ) -> PlannedSetups:
+        """Plan with one setup exchanged.
+
+        Args:
+            plan: The plan.
+            k: Index of the setup.
+            new: The other setup.
+            others: Inverse covariance of the state without setup k, shape (n_state, n_state).
+        """
+        information = others + self.information_of(new)
+        setups = (*plan.setups[:k], new, *plan.setups[k + 1 :])
+        return PlannedSetups(setups, information, self.error_of(information))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -113,7 +113,7 @@ def test_draws_consist_of_complete_cycles(raw_cycles):
     drawn = prepared.draw(np.random.default_rng(0), "cycles")
     o = prepared.fit.problem.observations
     for cycles in find_cycles(raw_cycles, o):
-        known = {tuple(prepared.values[c]) for c in cycles}
+        known = {tuple(prepared.fit.problem.values[c]) for c in cycles}
         assert {tuple(drawn[c]) for c in cycles} <= known
 
 
