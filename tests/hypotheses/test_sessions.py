@@ -31,6 +31,7 @@ from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.hypotheses.search import _nearly_as_likely, _Search, find_anomalies
 from orthocal.measurement.joining import join_sessions
 from orthocal.session.session import Conditions
+from orthocal.text import uncapitalised
 
 ENTERED = np.array([0.63e-3, 1.66e-3, -3.22e-3])
 """Offsets that the second session states, [m]."""
@@ -94,7 +95,7 @@ def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, 
     found = calibrate(paths, "full").assessment
     (finding,) = found.of_kind("offset of one drive")
     assert found.decision.verdict == "review"
-    assert "drive or its home switch has moved by" in finding.text
+    assert "drive y_slide or its home switch moved by" in uncapitalised(finding.text)
     by, std = (finding.numbers[f"y_slide.offset_{what}_mm"] for what in ("by", "std"))
     assert abs(by - 0.8) < 3.0 * std < 0.2
     (command,) = re.findall(r"`orthocal (calibrate .*)`", finding.action)
