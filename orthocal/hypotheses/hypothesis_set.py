@@ -14,6 +14,7 @@ from orthocal.hypotheses.hypothesis import MachineShift, SystematicEffect
 from orthocal.hypotheses.likelihood import Score
 from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.session.session import Session
+from orthocal.units import LIMIT
 
 MIN_LOST = 2
 """Number of wrong readings that are as simple as lost steps."""
@@ -76,6 +77,15 @@ class HypothesisSet:
         explanations = [t.explanation for t in self.terms]
         rows = sum(len(e.rows) if e.first is None else MIN_LOST for e in explanations)
         return len(self.terms), rows, sum(map(_count_drives, explanations))
+
+    @property
+    def changes_are_significant(self) -> bool:
+        """True if no change of the machine by an unknown amount may be 0, at 95 %."""
+        return all(
+            abs(a[0]) > LIMIT * std[0]
+            for t, a, std in zip(self.terms, self.amounts, self.stds, strict=True)
+            if t.shift is not None and not t.known
+        )
 
 
 def _count_drives(e: Explanation) -> int:

@@ -371,9 +371,11 @@ def _nearly_as_likely(
 ) -> list[HypothesisSet]:
     """The most likely sets and, if the best one adds a pair, single hypotheses.
 
-    A pair excludes a single hypothesis only if its second anomaly alone would be reported.
+    A pair excludes a single hypothesis only if its second anomaly alone would be reported. Another
+    set with a change of the machine that may be 0 is left out: the set without it is simpler.
     """
     best = ranked[0].log_posterior
+    ranked = [s for s in ranked if s is ranked[0] or s.changes_are_significant]
     near = [s for s in ranked if s.log_posterior > best - SIMILAR_LOG_BAYES]
     alone = [s for s in plausible if len(s.terms) < len(ranked[0].terms)]
     if alone and alone[0].log_posterior > best - CLEAR_LOG_BAYES:

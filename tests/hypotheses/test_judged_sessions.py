@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -88,8 +89,21 @@ def test_a_displaced_slide_is_named_with_its_amount_and_session(days):
     assert 0.003 < std < 0.025
     assert finding.places[0].file == str(days / "wednesday/session.yaml")
     assert finding.places[0].parameter == "x_slide"
-    assert "x_slide moved" in finding.text
+    assert "x_slide or its home switch moved" in finding.text
     assert "wednesday" in finding.action
+
+
+def test_a_drive_that_moved_is_described_alike_after_two_sessions_and_more(days):
+    """Only the second of two sessions states new offsets; the third one states the same."""
+    texts, kinds = set(), []
+    for names in (("monday", "wednesday"), ("monday", "tuesday", "wednesday")):
+        found = check_session(join_sessions([load_session(days / n) for n in names]))
+        (finding,) = [f for f in found.findings if f.severity == "review"]
+        kinds.append(finding.kind)
+        texts.add(re.sub(r"\d+\.\d+", "#", f"{finding.text} {finding.action}"))
+    assert kinds == ["offset of one drive", "machine changed"]
+    (text,) = texts
+    assert "not +# mm as stated" in text
 
 
 def test_without_a_change_the_detectable_size_is_stated(days):

@@ -25,10 +25,13 @@ from orthocal.hypotheses.families.sessions import (
     enter_backlash_wrongly,
     enter_wrongly,
 )
-from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.search import find_anomalies
+from orthocal.hypotheses.family_scores import list_families
+from orthocal.hypotheses.hypothesis import Rows
+from orthocal.hypotheses.linear_model import LinearModel, linear_model
+from orthocal.hypotheses.search import _nearly_as_likely, _Search, find_anomalies
 from orthocal.measurement.joining import join_sessions
 from orthocal.session.session import Conditions
+from orthocal.text import uncapitalised
 
 ENTERED = np.array([0.63e-3, 1.66e-3, -3.22e-3])
 """Offsets that the second session states, [m]."""
@@ -92,7 +95,7 @@ def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, 
     found = calibrate(paths, "full").assessment
     (finding,) = found.of_kind("offset of one drive")
     assert found.decision.verdict == "review"
-    assert "drive or its home switch has moved by" in finding.text
+    assert "drive y_slide or its home switch moved by" in uncapitalised(finding.text)
     by, std = (finding.numbers[f"y_slide.offset_{what}_mm"] for what in ("by", "std"))
     assert abs(by - 0.8) < 3.0 * std < 0.2
     (command,) = re.findall(r"`orthocal (calibrate .*)`", finding.action)
@@ -400,6 +403,28 @@ def test_memory_is_linear_in_the_readings(raw_cycles):
             tracemalloc.stop()
         assert [a.explanation.rows for a in found.found] == [(count // 3,)]
     assert peaks[1] < 2.5 * peaks[0]
+
+
+def test_a_change_that_may_be_zero_is_no_cause(plan):
+    """Slide y moved, and slide z did not: a set with both is no alternative, however likely."""
+    session = measure_twice(plan, ENTERED, changed=0.3e-3)
+    search = _Search(session, linear_model(session))
+    families = list_families(search.model, Rows(session), grouped=False)
+    drives = {
+        e.drives: search.scorer.term(family, h)
+        for family in families
+        if not family.known
+        for h in range(family.count)
+        if (e := family.explain(h)).kind == "offset of one drive"
+    }
+    moved, other = drives["y_slide",], drives["z_slide",]
+    alone, both = search.sets.evaluate_all([(moved,), (moved, other)], search.sound.about)
+    assert abs(alone.amounts[0][0]) > 2.0 * alone.stds[0][0]
+    assert abs(both.amounts[1][0]) < 2.0 * both.stds[1][0]
+    likely = replace(both, score=replace(both.score, log_likelihood=alone.score.log_likelihood))
+    likely = replace(likely, terms=(moved, replace(other, prior=0.0)))
+    assert likely.log_posterior == alone.log_posterior
+    assert _nearly_as_likely([alone, likely], [alone, likely]) == [alone]
 
 
 def test_no_machine_changes_by_a_hundred_tolerances(plan):

@@ -417,7 +417,7 @@ def _text(session: Session, e: Explanation) -> str:
         ),
         "machine changed": lambda: _changed(session, e),
         "lost steps": lambda: _lost_steps(session, e),
-        "offset of one drive": lambda: _other_offset(session, e),
+        "offset of one drive": lambda: _changed(session, e),
         "offsets not entered": lambda: _entered(e, "not entered"),
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
         "offsets entered twice": lambda: _entered(e, "added twice"),
@@ -552,15 +552,20 @@ def _swapped(session: Session, e: Explanation) -> str:
 
 
 def _changed(session: Session, e: Explanation) -> str:
-    """Clause about a change of the machine."""
-    what = joined(e.drives) or joined(e.parameters)
-    if e.drives and session.firmware is not None:
-        what = name_offsets(e.drives, firmware=True)
-    verb = "moved" if e.drives else "changed"
+    """Clause about a change of the machine, or an offset that looks like one."""
     when = f"before session {e.sessions[0]}"
     if e.apart:
         when = f"for {named('session', e.sessions)} only"
-    return f"the machine changed: {what} {verb}{_amount_of_change(session, e)} {when}"
+    amount = _amount_of_change(session, e)
+    if e.drives and session.firmware is None:
+        return (
+            f"drive {joined(e.drives)} or its home switch moved{amount} {when}, or "
+            f"{_other_offset(session, e)}"
+        )
+    what, verb = joined(e.parameters), "changed"
+    if e.drives:
+        what, verb = name_offsets(e.drives, firmware=True), "moved"
+    return f"the machine changed: {what} {verb}{amount} {when}"
 
 
 def _lost_steps(session: Session, e: Explanation) -> str:
@@ -585,22 +590,25 @@ def _amount_of_change(session: Session, e: Explanation) -> str:
 
 
 def _other_offset(session: Session, e: Explanation) -> str:
-    """Clause about a drive with another offset than the stated one, or a drive that moved.
+    """Clause about a drive with another offset in the controller than the stated one.
 
     An offset that is too small by an amount has the effect of an offset error of this amount.
     """
-    text = f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is not"
-    setups = [i for i, label in enumerate(session.labels) if label in e.sessions]
-    if e.amount is None or not setups:
-        return f"{text} the stated one"
+    names = list(dict.fromkeys(session.labels))
+    first = names.index(e.sessions[0]) if e.sessions[0] in names else None
+    if e.amount is None or first is None:
+        return "its offset in the controller is not the stated one"
+    if len(session.parts) == len(names) and session.parts[first].controller_offsets is None:
+        return "an offset is in the controller that the session does not state"
     drive = [d.name for d in session.robot.drives].index(e.drives[0])
     p = session.robot.parameters[e.parameters[0]]
-    stated = float((session.robot.drive_zero - session.zero_drives[setups[0]])[drive])
+    setup = list(session.setups)[session.labels.index(e.sessions[0])]
+    stated = float(session.active_during(setup)[drive])
     uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
     found = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
     return (
-        f"{text} {signed(stated * p.edge_factor)} {p.edge_unit} as stated, but {found}; or this "
-        f"drive or its home switch has moved{_amount_of_change(session, e)}"
+        f"its offset in the controller is not {signed(stated * p.edge_factor)} {p.edge_unit} as "
+        f"stated, but {found}"
     )
 
 

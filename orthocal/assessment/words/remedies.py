@@ -11,7 +11,7 @@ from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.session.session import Reading, Session, split_label
-from orthocal.text import quote_path, spans, uncapitalised
+from orthocal.text import quote_path, spans
 from orthocal.units import DRIVE_UNITS, MM
 
 
@@ -152,7 +152,9 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
             "Home the machine, go to the first posture of a setup and read it again. If it has "
             f"changed, look for the cause at {joined(e.drives)}, and measure the session again."
         )
-    if e.kind == "offset of one drive":
+    if e.kind == "offset of one drive" or (
+        e.kind == "machine changed" and e.drives and not e.apart
+    ):
         return _advise_other_offset(session, e)
     if e.kind != "machine changed":
         number = "backlash" if e.kind.startswith("backlash") else "offsets"
@@ -172,16 +174,9 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
         return (
             f"Make sure that the sessions state when they were measured. Calibrate {first} apart."
         )
-    calibrate_apart = (
+    return (
         f"Calibrate session {first} and later ones without the earlier ones: the values to enter "
         "must belong to the present machine."
-    )
-    if not e.drives:
-        return calibrate_apart
-    return (
-        "First make sure that all sessions state the active offsets (`controller.offsets_mm`): "
-        "offsets entered in between look the same. Otherwise: "
-        f"{uncapitalised(calibrate_apart)}"
     )
 
 
@@ -191,7 +186,7 @@ def _key_of_controller(session: Session, number: str) -> str:
 
 
 def _advise_other_offset(session: Session, e: Explanation) -> str:
-    """Action after an offset of one drive that differs from the stated one."""
+    """Action after a drive that moved, or has another offset than the stated one."""
     key = _key_of_controller(session, "offsets")
     return (
         f"Compare the offsets in the controller with `{key}` of session {e.sessions[0]}. "

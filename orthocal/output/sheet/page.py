@@ -158,8 +158,9 @@ def _front(
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
         f"differs by more than {_largest_difference(robot)}, the zero of the joint, a dimension or "
         "the direction of counting is wrong. Correct the zero in the controller (LinuxCNC: "
-        "HOME_OFFSET), or the others in machine.yaml (`orthocal new DIRECTORY --again`). From now on, drive to the numbers printed here, not by eye. Travel of "
-        f"the joints: {'; '.join(_travel(session))}.",
+        "HOME_OFFSET), or the others in machine.yaml (`orthocal new DIRECTORY --again`). From now "
+        "on, drive to the numbers printed here, not by eye. Travel of the joints: "
+        f"{'; '.join(_travel(session))}.",
         f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
@@ -344,8 +345,8 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
         return set_dial(session, setup.name)
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
-        f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Push the "
-        "stand lightly and release it: the hand must return to 0 within one step."
+        f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Push "
+        "the stand lightly and release it: the hand must return to 0 within one step."
     )
 
 
