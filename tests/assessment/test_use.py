@@ -72,7 +72,7 @@ def calibration(tmp_path_factory):
     session = simulate_session(load_plan(folder), TRUTH, seed=4, sigma=1e-6).session
     choice = Choice("offsets", prior=True)
     identified, _ = identify(session, choice, solver="variable-projection")
-    judged, recommended = Judgement((), AS_STATED), Recommendation("full", 1.0, (), 0.0)
+    judged, recommended = Judgement((), AS_STATED), Recommendation("full", 1.0, {}, 0.0)
     assessment = assess(identified, judgement=judged, recommendation=recommended)
     return replace(identified, assessment=assessment)
 
