@@ -376,11 +376,7 @@ def _text(session: Session, e: Explanation) -> str:
             session, e, UNITS.get(e.factor or 0.0, "in mm and read as inches")
         ),
         "decimal point": lambda: _written(session, e, "with a misplaced decimal point"),
-        "reversed sign": lambda: (
-            f"the sign of {_subject(session, e)} is reversed"
-            if e.scope in ("reading", "posture")
-            else f"the signs of {_subject(session, e)} are reversed"
-        ),
+        "reversed sign": lambda: _reversed(session, e),
         "misread dial": lambda: (
             f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
             f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by one turn or one mark of the dial"
@@ -502,6 +498,12 @@ def _offset(session: Session, e: Explanation) -> str:
         f"the reading before {first} was written twice, and all later readings{of_setup} are one "
         "line too late"
     )
+
+
+def _reversed(session: Session, e: Explanation) -> str:
+    """Clause about a reversed sign."""
+    signs = "sign of {} is" if e.scope in ("reading", "posture") else "signs of {} are"
+    return f"the {signs.format(_subject(session, e))} reversed"
 
 
 def _displaced_artefact(session: Session, e: Explanation) -> str:
