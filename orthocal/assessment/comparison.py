@@ -157,10 +157,9 @@ def compare_models(
     results, undetermined = _score_models(build, names, noises, options, report)
     if judgement.verdict != "enter":
         results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)
-    several = len({r.cycle for r in session.readings}) > 1
     comparison = Comparison(
         title=session.title,
-        labels=tuple(r.label + (f", cycle {r.cycle}" if several else "") for r in session.readings),
+        labels=_label_rows(session),
         noises=noises,
         independent=results[0].calibration.identifiability.n_readings if results else 0,
         results=results,
@@ -200,6 +199,12 @@ def _recommend(comparison: Comparison, session: Session, models: Sequence[str]) 
             for r in comparison.results
         ),
     )
+
+
+def _label_rows(session: Session) -> tuple[str, ...]:
+    """Labels of the readings, with the cycle if there are several."""
+    several = len({r.cycle for r in session.readings}) > 1
+    return tuple(r.label + (f", cycle {r.cycle}" if several else "") for r in session.readings)
 
 
 def _score_models(

@@ -111,7 +111,8 @@ def compute_backlash(
     active = calibration.compensated_backlash.tolist()
     entries, changes = [], []
     for drive, active_backlash in zip(calibration.robot.drives, active, strict=True):
-        estimate = by_name.get(f"{drive.name}.backlash")
+        name = f"{drive.name}.backlash"
+        estimate = by_name.get(name)
         if estimate is None or not (estimate.free or estimate.value):
             continue
         value, std = max(estimate.value, 0.0), estimate.std if estimate.free else 0.0
@@ -122,7 +123,8 @@ def compute_backlash(
         uncertainty = expanded_uncertainty(calibration, entry)
         determined = max(value, abs(value - active_backlash)) > uncertainty
         entries.append(entry)
-        changes.append(_Change({f"{drive.name}.backlash": entry.change}, determined))
+        limited = readings_limit(calibration, name)
+        changes.append(_Change({name: entry.change}, determined, limited))
     entering = _choose_changes(calibration, tool, changes)
     return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 
@@ -140,6 +142,8 @@ class _Change(NamedTuple):
     """Parameter to its change, [SI]."""
     determined: bool
     """Whether the change is larger than its expanded uncertainty."""
+    limited: bool
+    """Whether the readings limit the change (`readings_limit`)."""
 
 
 def _choose_changes(
@@ -155,9 +159,9 @@ def _choose_changes(
         tool: Its tool over the workspace; None if there is none.
         changes: Changes of the controller's correction.
     """
-    entered = [readings_limit(calibration, *change.amounts) for change in changes]
+    entered = [change.limited for change in changes]
     omitted: dict[str, float] = {}
-    undetermined = [i for i, c in enumerate(changes) if entered[i] and not c.determined]
+    undetermined = [i for i, c in enumerate(changes) if c.limited and not c.determined]
     for i in sorted(undetermined, key=lambda i: max(map(abs, changes[i].amounts.values()))):
         omitted |= changes[i].amounts
         if _changes_tool(calibration, tool, omitted):
@@ -219,7 +223,8 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
         limits = ELLIPSE_FACTOR * np.array([uncertainty, change_uncertainty])
         entries.append(entry)
         amounts = _screw_parameters(drive.name, entry.change)
-        changes.append(_Change(amounts, bool((amplitudes > limits).any())))
+        limited = readings_limit(calibration, *names)
+        changes.append(_Change(amounts, bool((amplitudes > limits).any()), limited))
     entering = _choose_changes(calibration, find_tool(calibration), changes)
     return tuple(
         e if enter else replace(e, enter=e.active)

@@ -121,10 +121,10 @@ def _inseparable(session: Session) -> Iterator[Finding]:
     model = linear_model(session)
     linearisation = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
-    indices_of_effects = {
-        name: [i for i, n in enumerate(model.problem.free) if n in parameter_units(effect, session)]
-        for name, effect in effects.items()
-    }
+    indices_of_effects = {}
+    for name, effect in effects.items():
+        members = parameter_units(effect, session)
+        indices_of_effects[name] = [i for i, n in enumerate(model.problem.free) if n in members]
     effect_columns = [i for indices in indices_of_effects.values() for i in indices]
     effect_slopes, other_slopes = (
         linearisation.jacobian[:, effect_columns],

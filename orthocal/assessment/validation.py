@@ -235,9 +235,7 @@ def validate_calibration(
     require_calibration(calibration)
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
-    fit = repeat_fit(calibration, join_sessions(measured))
-    predicted = np.array([p.value for p in calibration.free])
-    refit = assemble_calibration(fit, nominal=predicted)
+    fit, refit = _refit(calibration, join_sessions(measured))
     before = restore_session(calibration)
     all_sessions = join_sessions([before, *measured])
     judgement = judge_session(all_sessions)
@@ -318,6 +316,15 @@ def _apply_stated(
     calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
     _require_new(calibration, restated)
     return calibration, restated
+
+
+def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration]:
+    """Fit and calibration of new readings.
+
+    The nominal readings of the calibration are the predicted ones.
+    """
+    fit = repeat_fit(calibration, session)
+    return fit, assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
 
 
 def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:

@@ -55,11 +55,7 @@ def accuracy(
     from orthocal.export.formats import require_entering
     from orthocal.kinematics.workspace import cube
     from orthocal.measurement.files.coordinate_tables import read_points
-    from orthocal.output.text.accuracy import (
-        accuracy_json,
-        expect_further_hour,
-        render_accuracy,
-    )
+    from orthocal.output.text.accuracy import accuracy_json, expect_further_hour, render_accuracy
     from orthocal.output.text.layout import print_rich
 
     if half_side_mm is not None:

@@ -39,7 +39,6 @@ from orthocal.io.files import (
     read_parts,
     write_file,
 )
-from orthocal.robot.model import name_coordinates
 from orthocal.text import comment_safe, shorten
 from orthocal.units import MM, UM, format_fixed
 
@@ -539,6 +538,7 @@ def _describe_controller(
 ) -> str:
     """Note about the offsets in the controller, [m, rad], when the program runs."""
     from orthocal.assessment.assess import assessment_of
+    from orthocal.robot.model import name_coordinates
 
     listed = name_coordinates(result.robot.drives, values, partial(format_fixed, sign=True))
     keep = assessment_of(result).keeps_offsets

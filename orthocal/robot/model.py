@@ -579,7 +579,9 @@ def drive_keys(
         values: Value of each drive, [m, rad]; 0 by default.
     """
     texts: dict[str, list[str]] = {}
-    for drive, value in zip(drives, values or [0.0] * len(drives), strict=True):
+    if values is None:
+        values = [0.0] * len(drives)
+    for drive, value in zip(drives, values, strict=True):
         texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.6g}")
     return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
 

@@ -124,8 +124,10 @@ def arrow_parts(lengths: ArrayLike, width: float) -> tuple[Array, Array, Array]:
     head = np.copysign(girth, length)
     foot = length - head * head_length(width)
     shaft = np.copysign(np.maximum(np.abs(foot), 1e-9), length)
-    feet = np.outer(foot, [0.0, 0.0, 1.0])
-    return np.column_stack([girth, girth, shaft]), feet, np.column_stack([girth, girth, head])
+    none = np.zeros_like(length)
+    parts = (girth, girth, shaft), (none, none, foot), (girth, girth, head)
+    shafts, feet, heads = (np.column_stack(part) for part in parts)
+    return shafts, feet, heads
 
 
 def draw_arrow(

@@ -12,6 +12,14 @@ from orthocal.assessment.words.remedies import advise_about_sessions
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
 
 
+def describe_alternatives(session, explanation, alternative):
+    """The finding about an anomaly with two explanations."""
+    anomaly = Anomaly(explanation, 9.0, None, alternatives=(alternative,))
+    found = Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
+    (finding,) = describe_anomalies(session, found)
+    return finding
+
+
 @pytest.mark.parametrize("kind", get_args(AnomalyKind))
 def test_every_kind_has_a_sentence(root, kind):
     """A kind without one would end a command with an internal error."""
@@ -80,10 +88,7 @@ def test_an_action_that_costs_no_reading_comes_first(root):
         (inches, point, "Take one of these readings again. "),
         (setup, other, "Look at the mounting of the gauge. If a minus sign was forgotten, reverse"),
     ):
-        anomaly = Anomaly(explanation, 9.0, None, alternatives=(alternative,))
-        (finding,) = describe_anomalies(
-            session, Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
-        )
+        finding = describe_alternatives(session, explanation, alternative)
         assert finding.kind == "ambiguous"
         assert finding.action.startswith(first)
 
@@ -95,9 +100,7 @@ def test_a_setup_whose_gauge_may_have_moved_is_read_again(root):
     names = (session.readings[last[0]].setup,)
     displaced = Explanation("displaced gauge", "reading", rows=last, names=names)
     sign = Explanation("reversed sign", "reading", rows=last[:1], factor=-1.0)
-    anomaly = Anomaly(displaced, 9.0, None, alternatives=(sign,))
-    result = Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
-    (finding,) = describe_anomalies(session, result)
+    finding = describe_alternatives(session, displaced, sign)
     assert f"type `restart {session.readings[last[0]].line}`" in finding.action
 
 
@@ -108,10 +111,6 @@ def test_changes_between_sessions_that_readings_do_not_distinguish_are_listed(ro
         Explanation(kind, "session", drives=(drive,), sessions=("second",))
         for kind in ("offsets not entered", "offsets entered twice")
     )
-    result = Anomalies(
-        (Anomaly(missing, 9.0, None, alternatives=(twice,)),), 9.0, True, 1e-4, 1e-5, 1.0, 1.0
-    )
-    (finding,) = describe_anomalies(session, result)
-    first, *listed = finding.text.splitlines()
+    first, *listed = describe_alternatives(session, missing, twice).text.splitlines()
     assert first == "One of these may have happened:"
     assert [drive in line for line in listed] == [True, True]

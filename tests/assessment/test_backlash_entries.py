@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,7 @@ TRUTH = {
 
 NOISE = 6e-6
 
-KNOWN = {"judgement": SOUND, "recommendation": Recommendation("full", 1.0, (), 0.0)}
+KNOWN = {"judgement": SOUND, "recommendation": Recommendation("full", 1.0, {}, 0.0)}
 """Arguments of an assessment whose readings are sound, and whose model is not in question."""
 
 
@@ -297,17 +298,11 @@ def test_small_undetermined_changes_are_omitted(calibration, monkeypatch):
         controller_entries, "_changes_tool", lambda c, tool, changes: sum(changes.values()) > least
     )
     sizes = (1e-6, 30e-6, 8e-6, 4e-6)
-    changes = [{f"{i}.backlash": size} for i, size in enumerate(sizes)]
-    determined = [False, True, False, False]
-    entered = controller_entries._choose_changes(
-        calibration, None, changes, determined, [True] * len(changes)
-    )
-    assert entered == [False, True, True, False]
-
-    def choose(limited):
-        return controller_entries._choose_changes(
-            calibration, None, changes[:2], determined[:2], limited
-        )
-
-    assert choose([True, True]) == [False, True]
-    assert choose([True, False]) == [False, False]
+    changes = [
+        controller_entries._Change({f"{i}.backlash": size}, determined=i == 1, limited=True)
+        for i, size in enumerate(sizes)
+    ]
+    choose = partial(controller_entries._choose_changes, calibration, None)
+    assert choose(changes) == [False, True, True, False]
+    assert choose(changes[:2]) == [False, True]
+    assert choose([changes[0], changes[1]._replace(limited=False)]) == [False, False]

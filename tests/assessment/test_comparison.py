@@ -274,41 +274,29 @@ def test_known_noise_includes_the_rounding_of_the_gauge():
     assert noise.sigma == pytest.approx(math.hypot(5e-6, 10e-6 / math.sqrt(12.0)))
 
 
-def extend_to(problem, fit):
-    """Parameters of a fit to fewer setups, 0 for the nuisance parameters of the others."""
-    found = dict(zip(fit.problem.free, fit.solution.theta, strict=True))
-    return np.array([found.get(name, 0.0) for name in problem.free])
+def assert_predicted_without(setup, session, result, tolerance):
+    """Its prediction errors are those of a fit without its rows; its own mounting counts as 0."""
+    rest = replace(session, readings=tuple(r for r in session.readings if r.setup != setup))
+    problem = build_problem(session, model=result.model)
+    fit = fit_problem(build_problem(rest, model=result.model))
+    sigma = result.calibration.noise.sigma  # the weight beside the priors
+    solution = NonlinearProgram(fit.problem).solve(sigma=sigma)
+    found = dict(zip(fit.problem.free, solution.theta, strict=True))
+    theta = np.array([found.get(name, 0.0) for name in problem.free])
+    o = problem.observations
+    errors = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))
+    rows = [i for i, r in enumerate(session.readings) if r.setup == setup]
+    assert rows
+    assert result.exact.prediction_error[rows] == pytest.approx(errors[rows], abs=tolerance)
 
 
 def test_omitted_setups_are_predicted_by_fits_without_their_rows(experiment_2, table1):
-    for i, row in list(enumerate(experiment_2.readings))[::2]:
-        rest = replace(
-            experiment_2, readings=tuple(r for r in experiment_2.readings if r.setup != row.setup)
-        )
-        problem = build_problem(experiment_2, model="offsets")
-        fit = fit_problem(build_problem(rest, model="offsets"))
-        sigma = table1["offsets"].calibration.noise.sigma  # the weight beside the priors
-        solution = NonlinearProgram(fit.problem).solve(sigma=sigma)
-        theta = extend_to(problem, replace(fit, solution=solution))
-        o = problem.observations
-        error = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))[i]
-        assert table1["offsets"].exact.prediction_error[i] == pytest.approx(error, abs=1e-9)
+    for row in experiment_2.readings[::2]:
+        assert_predicted_without(row.setup, experiment_2, table1["offsets"], 1e-9)
 
 
 def test_an_omitted_setup_is_predicted_with_priors(raw_cycles, cycles):
-    setup = "xz"
-    rest = replace(raw_cycles, readings=tuple(r for r in raw_cycles.readings if r.setup != setup))
-    result = cycles["lengths"]
-    sigma = result.calibration.noise.sigma
-    problem = build_problem(raw_cycles, model="lengths")
-    fit = fit_problem(build_problem(rest, model="lengths"))
-    solution = NonlinearProgram(fit.problem).solve(sigma=sigma)
-    theta = extend_to(problem, replace(fit, solution=solution))
-    o = problem.observations
-    errors = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))
-    for i, row in enumerate(raw_cycles.readings):
-        if row.setup == setup:
-            assert result.exact.prediction_error[i] == pytest.approx(errors[i], abs=2e-8)
+    assert_predicted_without("xz", raw_cycles, cycles["lengths"], 2e-8)
 
 
 def test_linearised_and_exact_predictions_nearly_agree(cycles):

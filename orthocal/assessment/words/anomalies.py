@@ -502,10 +502,8 @@ def _offset(session: Session, e: Explanation) -> str:
 
 def _reversed(session: Session, e: Explanation) -> str:
     """Clause about a reversed sign."""
-    subject = _subject(session, e)
-    if e.scope in ("reading", "posture"):
-        return f"the sign of {subject} is reversed"
-    return f"the signs of {subject} are reversed"
+    signs = "sign of {} is" if e.scope in ("reading", "posture") else "signs of {} are"
+    return f"the {signs.format(_subject(session, e))} reversed"
 
 
 def _displaced_artefact(session: Session, e: Explanation) -> str:

@@ -304,8 +304,12 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
     lines = []
     for part in tool.use.parts:
         if part.condition == "approach" and tool.without_backlash is not None:
-            if tool_mm(tool.without_backlash) != tool_mm(tool.entered):
-                lines.append(describe_without_backlash(tool.without_backlash))
+            present = tool_mm(tool.without_backlash)
+            if present != tool_mm(tool.entered):
+                lines.append(
+                    f"With the backlash that the controller compensates now: {present}, unless all "
+                    "positions are approached from one side."
+                )
             continue
         without = math.sqrt(max(tool.entered**2 - part.size**2, 0.0))
         added = tool.entered - without
@@ -326,18 +330,6 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
         elif tool.use.payload is not None:
             lines.append(f"A payload of {_describe_range(tool.use.payload)} kg adds {amount}.")
     return lines
-
-
-def describe_without_backlash(rms: float) -> str:
-    """Sentence about the tool error with the present backlash of the controller.
-
-    Args:
-        rms: RMS of that tool error, [m].
-    """
-    return (
-        f"With the backlash that the controller compensates now: {tool_mm(rms)}, unless all "
-        "positions are approached from one side."
-    )
 
 
 def _describe_range(limits: tuple[float, float]) -> str:

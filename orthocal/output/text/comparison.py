@@ -158,14 +158,11 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     shown = [n for n in names if all_rows or n in named or is_offset(n)]
     parameters = results[0].calibration.robot.parameters
     half = {
-        r.model: dict(
-            zip(
-                [p.name for p in r.calibration.free],
-                r.calibration.expanded_uncertainties.tolist(),
-                strict=True,
-            )
-        )
+        (r.model, p.name): uncertainty * p.edge_factor
         for r in results
+        for p, uncertainty in zip(
+            r.calibration.free, r.calibration.expanded_uncertainties.tolist(), strict=True
+        )
     }
     rows = []
     for name in shown:
@@ -175,7 +172,7 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
                 continue
             linear, exact = (s.estimates[name] for s in (r.linearised, r.exact))
             numbers = [signed(v * p.edge_factor) for v in (linear, exact)]
-            spread = plain(half[r.model][name] * p.edge_factor)
+            spread = plain(half[r.model, name])
             rows.append((name if first else "", r.model, *numbers, spread, p.edge_unit))
             first = False
     omitted = len(names) - len(shown)

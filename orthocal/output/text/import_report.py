@@ -18,7 +18,7 @@ from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
 from orthocal.printers.log import PrintedDistance
 from orthocal.printers.settings import DeltaSettings
-from orthocal.text import list_some, quote_path, runs
+from orthocal.text import list_some, quote_path, spans
 from orthocal.units import DEG, MM, to_mm
 
 UNIT_SYMBOLS = {"um": "µm"}
@@ -34,9 +34,6 @@ CHANGES = {
 
 MOST_NAMES = 6
 """Maximum number of replaced names in the text."""
-
-MOST_RANGES = 8
-"""Maximum number of ranges of rows in the text."""
 
 
 def format_import(result: TableImport) -> str:
@@ -118,11 +115,8 @@ def _describe_column(table: Table, index: int) -> str:
 
 
 def _format_rows(lines: Iterable[int]) -> str:
-    """Numbers of rows as ranges, such as `rows 3, 7-12`."""
-    numbers = sorted(set(lines))
-    ranges = [str(a) if a == b else f"{a}-{b}" for a, b in runs(numbers)]
-    word = "row" if len(numbers) == 1 else "rows"
-    return f"{word} {list_some(ranges, MOST_RANGES)}"
+    """Numbers of rows as ranges, such as `rows 3, 7 to 12`."""
+    return spans(sorted(set(lines)), "row")
 
 
 def _describe_changes(result: TableImport) -> str:
