@@ -285,6 +285,7 @@ def _session_record(session: Session) -> SessionRecord:
         gauge_sigma=session.gauge.sigma,
         gauge_resolution=session.gauge.resolution,
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
+        controller_origin=session.controller_origin,
         purpose=session.purpose,
         seed=session.seed,
         compensation=session.compensation,

@@ -113,6 +113,8 @@ class SessionRecord:
     """Resolution of the gauge, [m]."""
     controller_offsets: Many[Number] | None
     """Active offsets, [m, rad]; None if not stated."""
+    controller_origin: tuple[Number, Number, Number]
+    """Machine coordinates (G53) of the world's origin, [m]."""
     purpose: Purpose | None
     """Model and free errors that the session states."""
     seed: Count | None

@@ -205,6 +205,7 @@ def restore_session(calibration: Calibration) -> Session:
             for r in calibration.residuals
         ),
         controller_offsets=None if offsets is None else read_only(offsets),
+        controller_origin=record.controller_origin,
         compensation=record.compensation,
         firmware=record.firmware,
         adjusted=dict(record.adjusted),

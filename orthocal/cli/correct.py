@@ -276,6 +276,7 @@ def _prepare(
         file,
         axes=field.axes,
         offsets=controller.work_offsets,
+        origin=result.session.controller_origin,
         start=controller.start,
         one_tool=tip is not None,
     )

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command, read_numbers
+from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command
 from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError, SessionError
@@ -20,7 +20,6 @@ def sheet(
     session: PlanPath,
     feed: float = 600.0,
     approach_feed: float = 120.0,
-    shift_mm: str = "0,0,0",
     dwell: float | None = None,
     trigger: str | None = None,
     ini: Path | None = None,
@@ -36,8 +35,6 @@ def sheet(
     Args:
         feed (MM/MIN): Feed between postures.
         approach_feed (MM/MIN): Feed over the last 2 mm to a posture.
-        shift_mm (X,Y,Z): Machine coordinates (G53) of the tool centre point at the
-            mechanical zero, mm.
         dwell (SECONDS): Time at each reading instead of a pause (G4).
         trigger (OUTPUT): Trigger of a logger after the dwell (default: 1 s): digital output 0 to
             63 (M64, M65 of LinuxCNC), or an M-code from M100 to M199.
@@ -46,8 +43,7 @@ def sheet(
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
 
-    x, y, z = read_numbers(shift_mm, "--shift-mm", "XYZ")
-    options = ProgramOptions(feed, approach_feed, (x, y, z), dwell, trigger)
+    options = ProgramOptions(feed, approach_feed, dwell, trigger)
     directory = out or (session if is_folder(session) else session.parent)
     require_writable(directory)
     plan = orthocal.load_plan(session)

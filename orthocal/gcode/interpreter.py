@@ -1,4 +1,4 @@
-"""Interpreter of a program: modes, tools, positions and motions in machine coordinates."""
+"""Interpreter of a program: modes, tools, positions and motions in coordinates of the world."""
 
 from __future__ import annotations
 
@@ -229,6 +229,10 @@ def _tool_name(number: float | None) -> str:
     return "the tool that was loaded before" if number is None else f"T{number:g}"
 
 
+def _subtract(point: Vector, origin: Vector) -> Vector:
+    return point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
+
+
 class Interpreter:
     """Interpreter that reads a program line by line.
 
@@ -237,6 +241,7 @@ class Interpreter:
         axes: Indices of the axes that the drives command.
         offsets: Zeros of the work coordinate systems in machine coordinates, [m], by name. Without
             G54 the program starts in machine coordinates.
+        origin: Machine coordinates of the world's origin, [m].
         start: Position before the program, in coordinates of the program, [m]; None if unknown.
         one_tool: Whether to refuse a second tool.
     """
@@ -247,20 +252,21 @@ class Interpreter:
         *,
         axes: Sequence[int],
         offsets: Mapping[str, Vector],
+        origin: Vector = (0.0, 0.0, 0.0),
         start: Vector | None = None,
         one_tool: bool = False,
     ) -> None:
         self.file, self.axes = file, tuple(axes)
         self.modes = Modes()
         self.tools = Tools(one=one_tool)
-        self.offset = zero = offsets.get("G54", (0.0, 0.0, 0.0))
-        """Zero of the work coordinates, [m]."""
+        self._offsets = {name: _subtract(zero, origin) for name, zero in offsets.items()}
+        self.offset = zero = self._offsets.get("G54", _subtract((0.0, 0.0, 0.0), origin))
+        """Zero of the work coordinates in the world, [m]."""
         self.position: list[float | None] = [
             (None if start is None else start[k] + zero[k]) if k in self.axes else 0.0
             for k in range(3)
         ]
-        """Programmed position of the tool, [m]; None if unknown."""
-        self._offsets = offsets
+        """Programmed position of the tool in the world, [m]; None if unknown."""
         self._letters = {k: AXES[k] for k in self.axes}
         self._accepted = _ACCEPTED.union(self._letters.values())
         self._moved = False

@@ -27,7 +27,7 @@ from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import GaugeZero, Sensor, is_difference
+from orthocal.sensors.protocol import GaugeZero, Sensor, Triple, is_difference
 from orthocal.units import MM
 
 DISTANCE_DECIMALS = 9
@@ -273,6 +273,8 @@ class Session:
     """Active offsets, shape (n_drives,), [m, rad]; None if not stated."""
     compensation: Compensation = ()
     """Compensation of backlash and errors of screws by the controller; empty if not stated."""
+    controller_origin: Triple = (0.0, 0.0, 0.0)
+    """Machine coordinates (G53) of the world's origin, [m]."""
     offsets_from: Path | None = None
     """Path to the calibration whose offsets were entered; None if not stated."""
     firmware: DeltaSettings | None = None

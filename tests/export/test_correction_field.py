@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -274,6 +275,14 @@ def test_command_line(command, tmp_path):
     assert got == pytest.approx(corrected, abs=1e-4)
     assert np.abs(corrected - [11.0, 2.0, -2.0]).max() > 0.01
     assert np.abs(entered_offsets(machine)).max() > 1e-4
+    session = replace(machine.session, controller_origin=(0.01, 0.0, -0.005))
+    write_calibration(replace(machine, session=session), tmp_path / "calibration.json")
+    code, out, _ = command(PROGRAM, "--offsets", "active")
+    got = read_polyline(out.splitlines())[0][0][0] - [10.0, 0.0, -5.0]
+    assert got == pytest.approx(expected([-9.0, 2.0, 8.0], np.zeros(3)), abs=1e-4)
+    code, out, _ = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "20,0,0")
+    got = read_polyline(out.splitlines())[0][0][0] + [10.0, 0.0, 5.0]
+    assert got == pytest.approx(expected([11.0, 2.0, 8.0], np.zeros(3)), abs=1e-4)
     code, _, err = command(PROGRAM, "--out", str(tmp_path / "o.ngc"), "--tool=-3,0,-50.5")
     assert "For a tip at -3, 0, -50.5 mm from the tool centre point." in err
     assert (tmp_path / "o.ngc").read_bytes().endswith(b"F100 (\xe9)\r\n")

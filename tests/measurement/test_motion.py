@@ -350,11 +350,11 @@ def test_path_that_leaves_the_travel_passes_through_the_mechanical_zero(small):
         assert nominal_closure(robot).inverse(path)[:, 2].max() < z.upper
 
 
-def test_shift_moves_all_coordinates(small, motions):
+def test_the_origin_moves_all_coordinates(small, motions):
     motion = motions[0]
     plain, _ = read_program(write_program(small, motion), small.robot)
-    options = ProgramOptions(shift_mm=(1.0, -2.0, 300.5), feed=1000.0)
-    text = write_program(small, motion, options)
+    elsewhere = replace(small, controller_origin=(1e-3, -2e-3, 300.5e-3))
+    text = write_program(elsewhere, motion, ProgramOptions(feed=1000.0))
     moved, _ = read_program(text, small.robot)
     assert moved - plain == pytest.approx(np.tile([1.0, -2.0, 300.5], (len(plain), 1)))
     assert "F1000" in text
@@ -365,14 +365,13 @@ def test_shift_moves_all_coordinates(small, motions):
     [
         ("feed", 0.0, "--feed"),
         ("approach_feed", float("nan"), "--approach-feed"),
-        ("shift_mm", (0.0, 1e9, 0.0), "--shift-mm"),
         ("dwell", 0.01, "--dwell"),
         ("dwell", float("nan"), "--dwell"),
         ("trigger", "64", "--trigger"),
         ("trigger", "M30", "--trigger"),
     ],
 )
-def test_feeds_and_shifts_out_of_range_are_refused(option, value, where):
+def test_options_out_of_range_are_refused(option, value, where):
     with pytest.raises(ParameterError) as refused:
         ProgramOptions(**{option: value})
     assert refused.value.where == where
@@ -578,10 +577,9 @@ def test_a_ball_bar_keeps_its_length_between_its_readings(bar):
 def test_a_program_waits_before_it_moves_where_a_fixed_ball_may_stand(bar, aligned_at):
     """It names its first posture, in machine coordinates, where the ball stays."""
     setups = {"bar": replace(bar.setups["bar"], aligned_at=aligned_at)}
-    session = replace(bar, setups=setups)
+    session = replace(bar, setups=setups, controller_origin=(1e-3, 2e-3, 3e-3))
     (motion,) = plan_motion(session)
-    options = ProgramOptions(shift_mm=(1.0, 2.0, 3.0), dwell=1.0)
-    lines = write_program(session, motion, options).splitlines()
+    lines = write_program(session, motion, ProgramOptions(dwell=1.0)).splitlines()
     pause = lines.index("M0")
     assert pause < next(i for i, line in enumerate(lines) if line.startswith("G53"))
     begin = motion.alignment or motion.stops[0]

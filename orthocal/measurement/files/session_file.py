@@ -50,6 +50,7 @@ from orthocal.sensors.protocol import (
     SetupKeys,
     default_zero,
     reads_pairs,
+    triple,
 )
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import base_name
@@ -374,6 +375,7 @@ def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
     offsets = build_offsets(keys.controller, robot, where)
     compensation = build_compensation(keys.controller, robot, folder=file.parent, where=where)
     firmware = build_firmware(keys.controller, robot, where)
+    origin = (keys.controller and keys.controller.origin_mm) or (0.0, 0.0, 0.0)
     for name in keys.adjusted_mm:
         require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
@@ -402,6 +404,7 @@ def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
         setups=setups,
         readings=(),
         controller_offsets=offsets,
+        controller_origin=triple(origin, MM),
         offsets_from=(
             Path(os.path.normpath(file.parent / keys.offsets_from)) if keys.offsets_from else None
         ),

@@ -53,6 +53,11 @@ MOST_NAMES = 1_000
 LARGEST_TRIM = 5.0
 """Largest backlash or trim that a controller compensates, [mm] or degrees."""
 
+FARTHEST_ORIGIN_MM = 1e5
+"""Largest machine coordinate of the world's origin, [mm]."""
+
+OriginCoordinate = Annotated[Number, Field(ge=-FARTHEST_ORIGIN_MM, le=FARTHEST_ORIGIN_MM)]
+
 GaugeNoise = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
 RangeLimit = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
 
@@ -172,6 +177,8 @@ class ControllerKeys(Keys):
     """Table of trims for each drive (COMP_FILE of LinuxCNC, type 1); null for none."""
     firmware: FirmwareKeys | None = None
     """Firmware of a delta printer, in whose coordinates the postures are stated."""
+    origin_mm: tuple[OriginCoordinate, OriginCoordinate, OriginCoordinate] | None = None
+    """Machine coordinates (G53) of the world's origin; 0, 0, 0 by default."""
 
     @property
     def offset_keys(self) -> list[str]:

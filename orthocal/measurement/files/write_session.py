@@ -61,8 +61,8 @@ def session_document(session: Session) -> dict[str, Any]:
     }
     if payload := _payload(session):
         document["payload_kg"] = payload
-    if session.controller_offsets is not None or session.compensation or session.firmware:
-        document["controller"] = _controller_document(session)
+    if controller := _controller_document(session):
+        document["controller"] = controller
     if session.adjusted:
         document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
     if calibration := _calibration_document(session):
@@ -150,6 +150,8 @@ def _controller_document(session: Session) -> dict[str, Any]:
         ]
     if session.firmware is not None:
         document["firmware"] = firmware_document(session.firmware)
+    if any(session.controller_origin):
+        document["origin_mm"] = [tidy(v / MM) for v in session.controller_origin]
     return document
 
 

@@ -54,9 +54,6 @@ PULSE_TIME = 0.1
 TRIGGER = re.compile(r"(?P<output>[0-9]|[1-5][0-9]|6[0-3])|M1[0-9][0-9]")
 """Digital output of LinuxCNC, or an M-code of the user."""
 
-LARGEST_SHIFT = 1e5
-"""Largest machine coordinate of the world's origin, [mm]."""
-
 PREAMBLE = (
     "(Every motion is in machine coordinates: G53 G1 in G90)",
     "(Work offsets G54 to G59.3, G92 and rotation have no effect; G49 cancels the tool length)",
@@ -76,15 +73,13 @@ class ProgramOptions:
     """Options of measuring programs.
 
     Raises:
-        ParameterError: If a feed or a shift is out of range.
+        ParameterError: If a feed, the dwell or the trigger is out of range.
     """
 
     feed: float = 600.0
     """Feed between postures, [mm/min]."""
     approach_feed: float = 120.0
     """Feed of the approach, [mm/min]."""
-    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Machine coordinates (G53) of the world's origin, [mm]."""
     dwell: float | None = None
     """Dwell at each reading instead of a pause, [s]; None for a pause."""
     trigger: str | None = None
@@ -97,10 +92,6 @@ class ProgramOptions:
                 raise ParameterError(
                     f"found {feed:g}; expected 1 to {LARGEST_FEED:g} mm/min", where=name
                 )
-        if not all(abs(v) <= LARGEST_SHIFT for v in self.shift_mm):
-            raise ParameterError(
-                f"expected numbers within ±{LARGEST_SHIFT:g} mm", where="--shift-mm"
-            )
         if self.dwell is not None and not 0.1 <= self.dwell <= LONGEST_DWELL:
             raise ParameterError(
                 f"found {self.dwell:g}; expected 0.1 to {LONGEST_DWELL:g} s", where="--dwell"
@@ -163,14 +154,14 @@ def write_program(
         f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
         f"({comment_safe(sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
-        f"{_words(robot, tool_at_zero(robot), options)})",
-        *_before_start(robot, sensor, stops[0], options),
+        f"{_words(session, tool_at_zero(robot))})",
+        *_before_start(session, sensor, stops[0]),
         *([SIGNS_NOTE] if stated else []),
         *PREAMBLE[:-1],
         *(["(Dwells at each reading: G4 P in seconds)"] if options.automatic else []),
         PREAMBLE[-1],
         f"F{options.feed:g}",
-        *_before_motion(robot, sensor, stops[0], options),
+        *_before_motion(session, sensor, stops[0]),
     ]
     mount = _mount(sensor, session.distinguish_gauge(of_setup.gauge))
     for i, stop in enumerate(stops):
@@ -187,7 +178,7 @@ def write_program(
         signs = describe_approach(robot, stop.approach).translate(SIGNS)
         side = f"; approach {signs}" if stated else ""
         lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
-        lines += _moves(robot, stop, options)
+        lines += _moves(session, stop, options)
         lines.append(f"(MSG, {_label(stop)}: {instruction})")
         following = stops[i + 1] if i + 1 < len(stops) else None
         needs_hand = i == 0 or bool(zero or stop.lift)
@@ -195,26 +186,22 @@ def write_program(
     return "\n".join([*lines, f"(MSG, end: {_end(sensor)})", "M2", ""])
 
 
-def _before_start(
-    robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
-) -> tuple[str, ...]:
+def _before_start(session: Session, sensor: Sensor, first: Stop) -> tuple[str, ...]:
     """Comments of the header about the position of the machine before the start."""
     if not isinstance(sensor, BallBar):
         return ("(Before start: gauge removed, machine at its mechanical zero)",)
     return (
         "(Before start: bar, fixed ball and its post removed, machine at its mechanical zero)",
         "(Or, where ball and post stay from an earlier setup, machine jogged around them to "
-        f"{_words(robot, first.point, options)})",
+        f"{_words(session, first.point)})",
     )
 
 
-def _before_motion(
-    robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
-) -> tuple[str, ...]:
+def _before_motion(session: Session, sensor: Sensor, first: Stop) -> tuple[str, ...]:
     """Pause before the first motion of a ball bar, whose fixed ball may be in the way."""
     if not isinstance(sensor, BallBar):
         return ()
-    start = _words(robot, first.point, options)
+    start = _words(session, first.point)
     return (
         "(MSG, before the first motion: remove fixed ball and post, or jog around them to "
         f"{start})",
@@ -271,19 +258,19 @@ def _read(
     return [*lines, *hold, "M0"] if hold else lines
 
 
-def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
+def _moves(session: Session, stop: Stop, options: ProgramOptions) -> list[str]:
     """Motion to the start of the approach, and the approach."""
     targets: list[tuple[Array | None, float]] = [(point, options.feed) for point in stop.via]
     targets += [(stop.approach_point, options.feed), (stop.point, options.approach_feed)]
-    return [f"G53 G1 {_words(robot, point, options)} F{feed:g}" for point, feed in targets]
+    return [f"G53 G1 {_words(session, point)} F{feed:g}" for point, feed in targets]
 
 
-def _words(robot: Robot, point: Array | None, options: ProgramOptions) -> str:
-    """G-code words of a point in machine coordinates, [mm]."""
-    coordinates = () if robot.tcp is None else robot.tcp.coordinates
+def _words(session: Session, point: Array | None) -> str:
+    """G-code words of a point of the world in machine coordinates, [mm]."""
+    coordinates = () if session.robot.tcp is None else session.robot.tcp.coordinates
     return " ".join(
-        f"{LETTERS[c]}{format_fixed(v + options.shift_mm[c], DECIMALS)}"
-        for c, v in zip(coordinates, np.asarray(point) / MM, strict=True)
+        f"{LETTERS[c]}{format_fixed((v + session.controller_origin[c]) / MM, DECIMALS)}"
+        for c, v in zip(coordinates, np.asarray(point), strict=True)
     )
 
 

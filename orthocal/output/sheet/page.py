@@ -182,7 +182,7 @@ def _front(
         + _numbered(_reading_rules(session, motions))
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3 + several)
-        + (_programs(options, with_bar=with_bar) if with_programs else "")
+        + (_programs(session, options, with_bar=with_bar) if with_programs else "")
     )
 
 
@@ -202,11 +202,11 @@ def _largest_difference(robot: Robot) -> str:
     return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
 
 
-def _programs(options: ProgramOptions | None, *, with_bar: bool) -> str:
+def _programs(session: Session, options: ProgramOptions | None, *, with_bar: bool) -> str:
     """Advice for running the programs."""
     options = options or ProgramOptions()
-    shift = options.shift_mm
-    origin = f", world origin at ({', '.join(f'{v:g}' for v in shift)}) mm" if any(shift) else ""
+    at = session.controller_origin
+    origin = f", world origin at ({', '.join(f'{v / MM:g}' for v in at)}) mm" if any(at) else ""
     stops = "stop (M0) in the alignment posture and at each reading"
     if options.automatic:
         stops = (

@@ -19,7 +19,7 @@ from gauges import with_gauges
 from lxml import etree
 from machines import place
 
-from orthocal import load_plan
+from orthocal import load_plan, write_session
 from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting
 from orthocal.builder.orthoglide import Orthoglide
@@ -327,21 +327,22 @@ def test_sheet_without_a_tool_has_joints_alone(root, tmp_path):
 
 def test_the_command_writes_beside_the_session_or_elsewhere(small, tmp_path):
     words, out = ("sheet", small.path, "--out", tmp_path / "out"), tmp_path / "out"
-    done = run_orthocal(tmp_path, *words, "--shift-mm", "0,0,50")
+    done = run_orthocal(tmp_path, *words)
     assert done.returncode == 0
     assert f"Wrote {out}/sheet.html to print and 4 programs" in done.stderr
-    assert "Z50.0000" in (out / "03-zx.ngc").read_text()
-    assert "world origin at (0, 0, 50) mm" in (out / "sheet.html").read_text()
-    assert run_orthocal(tmp_path, *words).returncode == 0
     assert "Z50" not in (out / "03-zx.ngc").read_text()
+    # a session states where its world is in machine coordinates
+    write_session(replace(small, controller_origin=(0.0, 0.0, 0.05)), tmp_path / "moved")
+    assert load_plan(tmp_path / "moved").controller_origin == (0.0, 0.0, 0.05)
+    assert run_orthocal(tmp_path, "sheet", "moved").returncode == 0
+    assert "Z50.0000" in (tmp_path / "moved/03-zx.ngc").read_text()
+    assert "world origin at (0, 0, 50) mm" in (tmp_path / "moved/sheet.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: there is no such file"),
-        (["examples/workshop/plan.yaml", "--shift-mm", "1,2"], "--shift-mm: found '1,2'; expected"),
-        (["examples/workshop/plan.yaml", "--shift-mm", "1,2,z"], "--shift-mm: Z is 'z'; expected"),
         (["examples/workshop/plan.yaml", "--feed", "0"], "--feed: found 0; expected 1 to 20000"),
     ],
 )
