@@ -7,11 +7,18 @@ import shutil
 import pytest
 from calibrated import EXPERIMENT_2, calibrated
 from commands import run_orthocal
+from linuxcnc import few_nodes
 
 from orthocal import write_calibration
 from orthocal.cli.overwriting import WRITTEN
 
-pytestmark = pytest.mark.usefixtures("short_reports")
+
+@pytest.fixture(scope="module", autouse=True)
+def cheap_results(short_reports):
+    """Short reports and modules of few nodes: complete ones have tests of their own."""
+    with few_nodes():
+        yield
+
 
 MINE = "# my notes about orthocal\n"
 PROGRAM = "G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F300\nM2\n"
