@@ -28,10 +28,18 @@ class Done(NamedTuple):
     stderr: str
 
 
-def run_here(folder, act, *, argv=("orthocal",), typed=""):
+class Terminal(io.TextIOWrapper):
+    """Input that is typed at a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def run_here(folder, act, *, argv=("orthocal",), typed="", terminal=False):
     """Do something as a program does: in a folder, with streams and arguments of its own."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
-    stdin = io.TextIOWrapper(io.BytesIO(typed.encode()), encoding="utf-8")
+    kind = Terminal if terminal else io.TextIOWrapper
+    stdin = kind(io.BytesIO(typed.encode()), encoding="utf-8")
     code = 0
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
         with (
@@ -50,9 +58,11 @@ def run_here(folder, act, *, argv=("orthocal",), typed=""):
     return Done(code, *printed)
 
 
-def run_orthocal(folder, *words, typed=""):
-    """`orthocal` with arguments, in a folder; what is typed comes through a pipe."""
-    return run_here(folder, main, argv=("orthocal", *map(str, words)), typed=typed)
+def run_orthocal(folder, *words, typed="", terminal=False):
+    """`orthocal` with arguments, in a folder; what is typed comes from a pipe or a terminal."""
+    return run_here(
+        folder, main, argv=("orthocal", *map(str, words)), typed=typed, terminal=terminal
+    )
 
 
 def run_script(folder, path):
@@ -74,6 +84,6 @@ def run_line(folder, line):
     return Done(done.returncode, "", done.stderr)
 
 
-def orthocal(*words, typed=""):
+def orthocal(*words, **typed):
     """`orthocal` with arguments, where the tests run."""
-    return run_orthocal(".", *words, typed=typed)
+    return run_orthocal(".", *words, **typed)

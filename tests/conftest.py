@@ -155,6 +155,9 @@ def no_sensor_gains():
 @contextmanager
 def plans_of_few_candidates():
     """Plans of commands with few candidates and one start; tests/planning verify plans."""
+    from uncompared import uncompared
+
+    from orthocal.planning import tool_candidates
 
     def plan_readings(*args, starts=None, **options):
         return plan(*args, starts=1, **options)
@@ -163,6 +166,8 @@ def plans_of_few_candidates():
     with (
         patch.object(orthocal, "Equipment", lambda **stated: equipment(**stated | FEW)),
         patch.object(orthocal, "plan_readings", plan_readings),
+        patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:2]),
+        uncompared(),
     ):
         yield
 

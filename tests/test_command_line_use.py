@@ -21,6 +21,7 @@ from conftest import no_sensor_gains
 from independent import Expansion, IndependentMachine, States
 from linuxcnc import Joint, play, require_linuxcnc, run_program
 from programs import read_polyline
+from uncompared import uncompared
 
 from orthocal import (
     Machine,
@@ -172,7 +173,7 @@ def warming_machine(tmp_path_factory, short_reports):
     run(folder, "new", "mill", *options.split())
     day = "--temperature", TEMPERATURES[0]
     few = "--along 3 --across-mm 0 --sections 0.5 --starts 1".split()
-    with no_sensor_gains():
+    with no_sensor_gains(), uncompared():
         run(folder, "plan", "mill", *few, *day, "--out", "mill/both-sides")
 
     def identify(name, *sessions):  # without its report

@@ -411,12 +411,13 @@ def talk(command, answers, cwd):
     return process.wait(timeout=300), said.decode(errors="replace").replace("\r\n", "\n")
 
 
-def test_invalid_answers_are_asked_for_again(root, tmp_path):
+def test_invalid_answers_are_asked_for_again(tmp_path):
     answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
     answers += ["sideways\n", "up,down,up\n", "0\n", "90\n", "40:30\n", "-50:60,-50:60,-40:40\n"]
     answers += ["0\n", "3\n"]
-    command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
-    code, said = talk(command, answers, root)
+    words = "new", tmp_path / "mill", "--paper"
+    code, *printed = orthocal(*words, typed="".join(answers), terminal=True)
+    said = "".join(printed)
     assert code == 0, said
     assert said.count("Leg length, from hinge to hinge of a rod, mm: ") == 3
     assert "  legs of 250000 mm; expected 20 to 5000 mm" in said
@@ -498,7 +499,8 @@ DELTA = [
 ]
 
 
-def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
+def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path, monkeypatch):
+    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:3])
     code, said, _ = orthocal("new", tmp_path / "delta", *DELTA)
     assert code == 0
     assert "Plan: 26 readings (1 closing) in 1 setup" in said
@@ -523,8 +525,7 @@ def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path, wit
     assert orthocal("new", tmp_path / "delta", *short, box).returncode == 0
 
 
-def test_stated_sensors_are_planned(tmp_path, monkeypatch, quick_plans, without_sensor_gains):
-    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:2])
+def test_stated_sensors_are_planned(tmp_path, quick_plans, without_sensor_gains):
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
     (tmp_path / "bar.yaml").write_text(bar)
     words = ["--with", tmp_path / "bar.yaml", "--hours", "0.4", "--tolerance", "*.offset_mm=1"]

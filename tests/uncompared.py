@@ -1,4 +1,4 @@
-"""Plans alone: `test_plan.py` and `test_plan_command.py` verify what they are compared with."""
+"""Plans alone: tests/planning verifies what they are compared with."""
 
 from __future__ import annotations
 
