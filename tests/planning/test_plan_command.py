@@ -101,7 +101,8 @@ def test_the_plan_does_not_depend_on_the_number_of_processes(monkeypatch, tmp_pa
         out = tmp_path / str(workers) / "plan"  # printed commands name its last part
         few = "--model offsets --hours 0.4".split()
         words = [*QUICK[:-1], 2, *few, "--workers", workers, "--out", out]
-        code, text, err = run_orthocal(".", "plan", "orthoglide", *words)
+        with uncompared():
+            code, text, err = run_orthocal(".", "plan", "orthoglide", *words)
         assert code == 0
         files = {p.name: p.read_bytes() for p in out.iterdir()}
         results.append((text, err.replace(str(out), ""), files))
