@@ -138,7 +138,10 @@ class Printer:
         """What a firmware reads as height where the probe triggers, shape (K,), [mm]."""
         z = np.full(len(xy), self.trigger)
         for _ in range(8):  # the height above the bed follows the commanded one nearly 1:1
-            z -= self.above_bed(firmware.travel(np.column_stack([xy, z]))) - self.trigger
+            off = self.above_bed(firmware.travel(np.column_stack([xy, z]))) - self.trigger
+            z -= off
+            if np.abs(off).max() < 1e-6:  # [mm]; the next one is a hundredth of it
+                break
         return z if rng is None else z + noise * rng.normal(size=len(z))
 
 
