@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
+from calibrated import identified
 from conftest import ROOT
 from scipy.optimize import brentq
 from tolerances import KINEMATICS, LAST_SIGMA, SAME_NUMBER
@@ -18,7 +19,7 @@ from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.tool_error import assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.unmodelled import error_jacobian
-from orthocal.estimation.fit import Fit, fit_problem
+from orthocal.estimation.fit import Fit, build_program, fit_problem
 from orthocal.estimation.linear import leg_parallelism_matrix, solve_equation_8
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
@@ -143,9 +144,8 @@ def test_the_objective_has_priors_means_and_the_pseudo_huber_loss(kind):
     session = orthocal.load_session(EXPERIMENT)
     choice = orthocal.Choice("lengths", known={"x_leg.length_mm": (0.12, 0.02)})
     problem = CalibrationProblem(session, choice.select(session.robot.parameters))
-    fit = fit_problem(problem, options=SolverOptions(loss=Loss(kind)))
     sigma = 20e-6
-    solution = fit.program.solve(sigma=sigma, start=fit.solution.theta)
+    solution = build_program(problem, SolverOptions(loss=Loss(kind))).solve(sigma=sigma)
     x = (problem.values - problem.predict(solution.theta)) / sigma
     x -= solution.zeros[problem.observations.zero] / sigma
     w = 1.345
@@ -166,7 +166,7 @@ def test_offsets_with_the_section_at_the_slide_and_in_the_world():
         setups[name] = replace(setup, sensor=replace(setup.sensor, section=world))
 
     def shown(of):
-        values = [p.value * 1e3 for p in orthocal.calibrate(of, "offsets").free]
+        values = [p.value * 1e3 for p in identified(of, "offsets").free]
         first, second, third = (f"{v:.3f}".replace("-", "−") for v in values)
         return f"{first}, {second} and {third} mm"
 
