@@ -37,10 +37,14 @@ expected, actual = defaultdict(list), defaultdict(list)  # mean squares of tool 
 
 
 def evaluate(
-    label: str, session: orthocal.Session, choice: orthocal.Choice, real: orthocal.Machine
+    label: str,
+    session: orthocal.Session,
+    model: str,
+    real: orthocal.Machine,
+    judgement: orthocal.Judgement | None = None,
 ) -> orthocal.Calibration:
     """Calibrate, and compare the calibrated tool with the actual one."""
-    result = orthocal.calibrate(session, choice, solver="variable-projection")
+    result = orthocal.calibrate(session, model, solver="variable-projection", judgement=judgement)
     tool = orthocal.assess_tool(result)
     drives = nominal.inverse(tool.workspace.points) - result.active_offsets
     errors = tool.measure(result.machine.forward(drives) - real.forward(drives))
@@ -54,18 +58,19 @@ for seed in range(MACHINES):
     errors = orthocal.draw_errors(plan.robot, names, seed=seed, tolerances=FIRST)
     real = orthocal.Machine(plan.robot, errors)
 
-    first = orthocal.simulate_session(plan, errors, seed=seed).session
-    evaluate("first round, offsets", first, orthocal.Choice("offsets", tolerances=FIRST), real)
-    full = orthocal.Choice("full", tolerances=FIRST)
-    calibration = evaluate("first round, full", first, full, real)
-    evaluate("  as of a line, exactly", simplify(first), full, real)
+    first = orthocal.simulate_session(plan, errors, seed=seed).session.with_tolerances(FIRST)
+    judgement = orthocal.judge_session(first)  # does not depend on the model
+    evaluate("first round, offsets", first, "offsets", real, judgement)
+    calibration = evaluate("first round, full", first, "full", real, judgement)
+    evaluate("  as of a line, exactly", simplify(first), "full", real)
 
     # the offsets that `orthocal calibrate` prints, and the same readings once more
-    offsets = np.round([entry.enter for entry in calibration.assessment.entries], 6)
-    entered = plan.with_controller(offsets)
+    entered = plan.with_controller(np.round([e.enter for e in calibration.assessment.entries], 6))
     second = orthocal.simulate_session(entered, errors, seed=100 + seed).session
-    evaluate("offsets entered, offsets", second, orthocal.Choice("offsets", tolerances=AGAIN), real)
-    evaluate("offsets entered, full", second, orthocal.Choice("full", tolerances=AGAIN), real)
+    second = second.with_tolerances(AGAIN)
+    judgement = orthocal.judge_session(second)
+    evaluate("offsets entered, offsets", second, "offsets", real, judgement)
+    evaluate("offsets entered, full", second, "full", real, judgement)
 
 print(f"{f'tool error of {MACHINES} machines, µm RMS':36}{'expected':>10}{'actual':>10}")
 for label, squares in actual.items():

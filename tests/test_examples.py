@@ -11,6 +11,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from calibrated import identified
 from commands import run_here, run_line, run_orthocal, run_script
 from conftest import ROOT, marked_reports, no_sensor_gains, plans_of_few_candidates
 from uncompared import uncompared
@@ -327,7 +328,7 @@ def test_simulated_examples_give_the_true_offsets(root, name):
     assert (folder / "session.yaml").read_text().startswith("# Simulated readings, not measured.")
     session = load_session(folder)
     truth = load_errors(folder / "truth.yaml", session.robot)
-    calibration = calibrate(session)
+    calibration = identified(session)
     for drive in session.robot.drives:
         estimate = calibration[f"{drive.name}.offset"]
         assert abs(estimate.value - truth[estimate.name]) < 3.0 * estimate.std
