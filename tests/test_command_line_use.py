@@ -1,7 +1,7 @@
 """Complete use of the command line on a machine with legs of 250 mm, up to a better part.
 
-new → record → check → calibrate → enter → calibrate → export → LinuxCNC. The machine is simulated
-with all errors at their tolerances and realistic gauge misalignment.
+new → check → calibrate → enter → calibrate → export → LinuxCNC. The machine is simulated with all
+errors at their tolerances and realistic gauge misalignment. `test_ball_bar_use.py` has `record`.
 
 With effects beside geometry: new → simulate → calibrate → export → again → simulate → validate →
 calibrate both → correct. The independent simulator makes the part.
@@ -52,17 +52,6 @@ def run(folder, *words, typed="", code=0):
     return done.stdout
 
 
-def measure(folder, session, errors, seed):
-    """Simulate the readings of a plan and type them line by line."""
-    simulated = simulate_session(load_plan(folder / session), errors, seed=seed).session
-    typed = [f"{v / MM:.2f}".replace(".", ",") for v in simulated.values]
-    printed = run(folder, "record", session, typed="\n".join([*typed, ""]))
-    assert f"All {len(typed)} readings are recorded." in printed
-    with open(folder / session / "readings.csv") as file:
-        read = [float(row["reading_mm"]) * MM for row in csv.DictReader(file)]
-    assert read == pytest.approx(simulated.values, abs=1e-12)
-
-
 def actual_tool_error(calibration, errors, command):
     """Tool error of the actual machine over the workspace after alignment, RMS, [m]."""
     tool = assess_tool(calibration)
@@ -77,7 +66,8 @@ def two_rounds(tmp_path_factory, short_reports):
     run(folder, "new", "mill", *DIMENSIONS.split(), "--tolerance", "*.offset_mm=4")
     robot = load_robot(folder / "mill")
     errors = draw_errors(robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 4.0})
-    measure(folder, "mill/first", errors, SEED)
+    plan = load_plan(folder / "mill/first")
+    write_session(simulate_session(plan, errors, seed=SEED).session, folder / "mill/first")
     run(folder, "check", "mill/first")
     run(folder, "calibrate", "mill/first", "--out", "one")
     one = load_calibration(folder / "one")
