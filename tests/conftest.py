@@ -97,12 +97,14 @@ def short_reports():
     """Reports with marks in place of plots and scenes, and without gains of usual sensors.
 
     All of these take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
+    Sheets have marks in place of pictures of the machine.
     """
     from orthocal.output.report import page
     from orthocal.output.text.accuracy import FurtherHour
 
     with (
         marked_plots(),
+        marked_pictures(),
         patch.object(page, "expect_further_hour", lambda _: FurtherHour(0.0, ())),
         patch.object(page, "_scene", lambda _: "<!-- scene -->"),
     ):
@@ -115,6 +117,15 @@ def marked_plots():
     from orthocal.output.report.figure import Plot
 
     with patch.object(Plot, "__call__", lambda plot, *_, **__: f'<svg id="{plot.name}"/>'):
+        yield
+
+
+@contextmanager
+def marked_pictures():
+    """Marks in place of pictures of the machine on sheets; tests/output/sheet has the pictures."""
+    from orthocal.output.sheet import page
+
+    with patch.object(page, "draw_machine", lambda *_: "<svg/>"):
         yield
 
 

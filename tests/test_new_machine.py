@@ -32,6 +32,8 @@ from orthocal.planning import tool_candidates
 from orthocal.planning.equipment import USUAL_BALL
 from orthocal.session.session import Purpose
 
+pytestmark = pytest.mark.usefixtures("short_reports")
+
 SIZES = {
     "--leg-mm": "250",
     "--travel-mm": "100:320",
