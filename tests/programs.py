@@ -200,3 +200,17 @@ def own_distances(points, polyline):
     square = np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
     t = np.clip(np.einsum("ij,ij->i", points - a, along) / square, 0.0, 1.0)
     return np.linalg.norm(a + t[:, None] * along - points, axis=1)
+
+
+def rigid_motion(before, after, weights):
+    """Rotation R and translation t that best map points p to R p + t (Kabsch 1976).
+
+    Args:
+        before: Points, shape (K, 3).
+        after: Their images, shape (K, 3).
+        weights: Weights of the points, shape (K,), with the sum 1.
+    """
+    first, second = weights @ before, weights @ after
+    u, _, vt = np.linalg.svd((weights[:, None] * (after - second)).T @ (before - first))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rotation, second - rotation @ first

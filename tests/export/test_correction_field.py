@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from calibrated import SOUND
 from commands import run_orthocal
-from programs import distances, read_polyline
+from programs import distances, read_polyline, rigid_motion
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assessment.assess import assessment_of
@@ -68,17 +68,14 @@ def test_aligned_corrections_keep_the_work_zero_and_the_form_of_the_part(real, t
         return tips(real.robot, real.errors, nominal.inverse(commanded) - OFFSETS, np.array(tool))
 
     targets, jogged = points + tool, move(points)
-    middles = [weights @ p for p in (targets, jogged)]
-    u, _, vt = np.linalg.svd((weights[:, None] * (jogged - middles[1])).T @ (targets - middles[0]))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation, translation = rigid_motion(targets, jogged, weights)
     corrected, refused = field(points)
     assert not refused
-    expected = (targets - middles[0]) @ rotation.T + middles[1]
+    expected = targets @ rotation.T + translation
     off = np.linalg.norm(move(corrected) - expected, axis=1).max()
     assert off < 1.05 * field.error < 0.1 * WITHIN
-    shift, turn = middles[1] - middles[0], rotation - np.eye(3)
-    assert np.linalg.norm(shift) > 50e-6
-    assert np.abs(turn).max() > 1e-4
+    assert np.linalg.norm(translation) > 50e-6
+    assert np.abs(rotation - np.eye(3)).max() > 1e-4
     # motions with and without correction differ by the tool error of an aligned workpiece
     difference = np.sqrt(weights @ ((corrected - points) ** 2).sum(axis=1))
     aligned = np.sqrt(weights @ ((jogged - expected) ** 2).sum(axis=1))
