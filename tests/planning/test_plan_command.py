@@ -19,7 +19,14 @@ from planned import FEW
 from processes import children_of, is_running, until
 from uncompared import uncompared
 
-from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
+from orthocal import (
+    MeasuringPlan,
+    load_plan,
+    load_session,
+    plan_readings,
+    summarize,
+    write_session,
+)
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import USUAL_BALL, Equipment
 from orthocal.planning.expected_error import CRITERIA
@@ -164,12 +171,15 @@ def test_offsets_that_too_few_readings_do_not_determine_are_named():
 
 
 def test_further_setups_of_a_session_are_planned(root, tmp_path):
-    session = root / "examples/workshop"
+    session = tmp_path / "workshop"
+    moved = replace(load_session(root / "examples/workshop"), controller_origin=(0.1, 0.0, 0.0))
+    write_session(moved, session)
     option, out = ["--tolerance", "*.offset_mm=8"], tmp_path / "out"
     words = ["plan", session, "--add", 2, *QUICK, *option, "--out", out]
     with uncompared():
         code, text, err = run_orthocal(".", *words)
     assert code == 0
+    assert load_plan(out).controller_origin == moved.controller_origin
     document = json.loads((out / "plan.json").read_text())
     assert document["setups"] == 2
     assert document["expected"]["aligned_um"] < document["before"]["aligned_um"]
