@@ -39,7 +39,15 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import Contact, Sensor, ToolPath, has_dial, instrument, tool_path
+from orthocal.sensors.protocol import (
+    Contact,
+    Sensor,
+    ToolPath,
+    has_dial,
+    instrument,
+    reads_pairs,
+    tool_path,
+)
 from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
@@ -191,8 +199,10 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
     """Plan the path through every setup, in the order of measurement.
 
     Raises:
-        SessionError: If there are too many readings, or a posture cannot be reached or approached.
+        SessionError: If there are too many readings, a setup reads pairs of postures, or a posture
+            cannot be reached or approached.
     """
+    _refuse_pairs(session)
     if len(session.readings) > MOST_STOPS:
         raise SessionError(
             f"plans {len(session.readings)} readings; a sheet holds at most {MOST_STOPS}",
@@ -226,6 +236,22 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows_by_setup), alignment, tuple(stops)))
     return tuple(motions)
+
+
+def _refuse_pairs(session: Session) -> None:
+    """Refuse setups whose readings belong to pairs of postures: no posture has a reading.
+
+    Raises:
+        SessionError: If there is such a setup; names the first.
+    """
+    for name in dict.fromkeys(r.setup for r in session.readings):
+        if reads_pairs(session.setups[name].sensor):
+            raise SessionError(
+                "each reading is taken between two postures; a sheet and programs stop in one "
+                "posture for each reading. Type these readings with `orthocal record`. For other "
+                "setups, run `orthocal sheet` on a session without this one",
+                where=f"{session.path or 'session'}: setups.{name}",
+            )
 
 
 def state_path_approaches(session: Session) -> Session:
