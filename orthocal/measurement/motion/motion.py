@@ -140,7 +140,8 @@ class Stop:
     lift: str = ""
     """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
     expected: float = 0.0
-    """Reading of the nominal machine, relative to the first reading, [m]."""
+    """Reading of the nominal machine, [m]; relative to the first reading unless the gauge zero is
+    known."""
     path: Array | None = None
     """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
     do not command the tool."""
@@ -285,6 +286,18 @@ def dial_zero(gauge: Gauge) -> str:
     """Text of the reading in the middle of a gauge's range, to which its dial is set, in mm."""
     low, high = gauge.range or (0.0, 0.0)
     return f"{0.5 * (low + high) / MM + 0.0:g}"
+
+
+def range_of_expected(session: Session, setup: str) -> tuple[float, float]:
+    """Lowest and highest expected reading within the range of a setup's gauge, [m].
+
+    The first reading is in the middle of the range unless the gauge zero is known.
+    """
+    limits = session.gauges[session.setups[setup].gauge].range or (-np.inf, np.inf)
+    if session.setups[setup].zero == "known":
+        return limits
+    half = 0.5 * (limits[1] - limits[0])
+    return -half, half
 
 
 def set_dial(session: Session, setup: str) -> str:
@@ -680,21 +693,21 @@ def _predict(
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
-    relative = predicted - predicted[ends[first] - 1]
-    limits = session.gauges[session.setups[setup].gauge].range
-    half_range = np.inf if limits is None else 0.5 * (limits[1] - limits[0])
+    if session.setups[setup].zero != "known":
+        predicted = predicted - predicted[ends[first] - 1]
+    low, high = range_of_expected(session, setup)
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
         if i > 0:  # the gauge is mounted at the first stop
             start = end - len(paths[i].points)
-            on_path = relative[start:end]
+            on_path = predicted[start:end]
             problems = [p for p in contact.problems[start:end] if p]
             if problems or not np.isfinite(on_path).all():
                 lift = "the tip would leave the rod" if not problems else problems[0]
-            elif np.abs(on_path).max() > half_range:
-                largest = f"{on_path[np.abs(on_path).argmax()] / MM:+.1f}".replace("-", "−")
+            elif (excess := np.maximum(low - on_path, on_path - high)).max() > 0.0:
+                largest = f"{on_path[excess.argmax()] / MM:+.1f}".replace("-", "−")
                 lift = f"the dial would go {largest} mm"
-        expected = float(relative[end - 1])
+        expected = float(predicted[end - 1])
         finished.append(replace(stop, lift=lift, expected=expected, path=paths[i].drives))
     return finished
