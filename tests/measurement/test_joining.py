@@ -228,7 +228,9 @@ def test_a_fit_is_of_one_problem_where_the_noise_does_not_settle(root):
 def test_a_file_has_one_state_of_machine_and_controller(sweep, tmp_path, change, named):
     """It states them once, so that readings of the other setups would be read with wrong ones."""
     joined = join_sessions([sweep, change(sweep.with_values(sweep.values))])
-    with pytest.raises(SessionError, match=f"setup 'sweep-1/.*' with other {named} than the session"):
+    with pytest.raises(
+        SessionError, match=f"setup 'sweep-1/.*' with other {named} than the session"
+    ):
         write_session(joined, tmp_path / "joined")
     assert not (tmp_path / "joined").exists()
     alike = join_sessions([change(sweep), change(sweep.with_values(sweep.values))])
