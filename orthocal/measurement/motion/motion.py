@@ -200,9 +200,14 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
     """Plan the path through every setup, in the order of measurement.
 
     Raises:
-        SessionError: If there are too many readings, a setup reads pairs of postures, or a posture
-            cannot be reached or approached.
+        SessionError: If sessions are joined, there are too many readings, a setup reads pairs of
+            postures, or a posture cannot be reached or approached.
     """
+    if session.joined:
+        raise SessionError(
+            "joins sessions, each with active offsets of its own; plan each session by itself",
+            where="session",
+        )
     _refuse_pairs(session)
     if len(session.readings) > MOST_STOPS:
         raise SessionError(
