@@ -74,6 +74,19 @@ def chi_square_tail(dof: float, value: float) -> float:
     return float(gammaincc(0.5 * dof, 0.5 * value))
 
 
+def log_chi_square_tail(dof: float, value: float) -> float:
+    """Logarithm of `chi_square_tail`, also where the probability is too small for a number.
+
+    There x = value/2 is much larger than a = dof/2, and Q(a, x) ≈ xᵃ exp(−x) / (Γ(a) (x − a + 1)),
+    the first convergent of the continued fraction.
+    """
+    tail = chi_square_tail(dof, value)
+    if tail > 0.0:
+        return math.log(tail)
+    a, x = 0.5 * dof, 0.5 * value
+    return a * math.log(x) - x - math.lgamma(a) - math.log(x - a + 1.0)
+
+
 def f_tail(dof: float, dof_below: float, value: float) -> float:
     """Probability that an F variable exceeds a value; `dof_below` belongs to the denominator."""
     return incomplete_beta(0.5 * dof_below, 0.5 * dof, dof_below / (dof_below + dof * value))

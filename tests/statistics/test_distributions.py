@@ -12,6 +12,7 @@ from orthocal.statistics.distributions import (
     chi_square_tail,
     f_tail,
     incomplete_beta,
+    log_chi_square_tail,
     median_of_largest,
     normal_quantile,
     t_quantile,
@@ -49,3 +50,13 @@ def test_the_median_of_the_largest_is_that_of_samples(stds):
     drawn = np.random.default_rng(1).normal(size=(40_000, len(stds))) * stds
     largest = np.abs(drawn).max(axis=1)
     assert median_of_largest(np.array(stds)) == pytest.approx(np.median(largest), rel=0.02)
+
+
+@pytest.mark.parametrize("value", [1.0, 1400.0, 2000.0, 1e6])
+def test_logarithms_of_tails_too_small_for_a_number(value):
+    """For an even number of degrees of freedom the tail is a finite sum."""
+    x = 0.5 * value
+    assert log_chi_square_tail(2.0, value) == pytest.approx(-x, **RELATIVE)
+    assert log_chi_square_tail(4.0, value) == pytest.approx(math.log1p(x) - x, rel=1e-8)
+    expected = math.log(1.0 + x + 0.5 * x**2) - x
+    assert log_chi_square_tail(6.0, value) == pytest.approx(expected, rel=1e-8)
