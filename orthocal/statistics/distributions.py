@@ -26,11 +26,11 @@ def median_of_largest(stds: Array) -> float:
     """Median of the largest absolute value of independent normal variables with mean 0.
 
     Args:
-        stds: Their standard deviations, shape (n,), positive.
+        stds: Their standard deviations, shape (n,). Variables without any are 0.
     """
     from scipy.special import erf
 
-    scales = math.sqrt(2.0) * stds
+    scales = math.sqrt(2.0) * stds[stds > 0.0]
     return least_number(lambda limit: float(np.prod(erf(limit / scales))) > 0.5)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -37,6 +38,12 @@ def test_quantiles(share):
     expected = centred * math.sqrt(2.0 / (1.0 - centred**2))
     assert t_quantile(2.0, share) == pytest.approx(expected, **RELATIVE)
     assert t_quantile(1e8, share) == pytest.approx(normal_quantile(share), rel=1e-6)
+
+
+def test_constants_do_not_change_the_median_of_the_largest():
+    with warnings.catch_warnings(action="error"):
+        with_constant = median_of_largest(np.array([0.0, 2.0, 1.0]))
+    assert with_constant == median_of_largest(np.array([2.0, 1.0]))
 
 
 def test_distributions_at_their_ends():
