@@ -58,7 +58,7 @@ def session_document(session: Session) -> dict[str, Any]:
     if session.source:
         document["source"] = session.source
     if session.seed is not None:
-        document["seed"] = session.seed
+        document["seed"] = int(session.seed)
     gauges = {
         name: _gauge_document(g) for name, g in session.gauges.items() if base_name(name) == name
     }
