@@ -440,7 +440,7 @@ def test_many_postures_are_thinned_out_for_the_animation(monkeypatch):
     monkeypatch.setattr("orthocal.output.scene.deviations.MAX_STOPS", 20)
     scene = draw_scene(session_of("sweep"))
     assert len(scene.steps) == 22
-    assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)
+    assert any("shows 20 of 30 stops" in fact for fact in scene.facts)
 
 
 def test_no_joint_leaps_between_two_frames(scene):
@@ -544,6 +544,15 @@ def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
 def test_exaggeration_must_be_positive(calibration, factor):
     with pytest.raises(ParameterError, match="expected a positive number"):
         draw_scene(calibration, exaggeration=factor)
+
+
+def test_the_stated_largest_exaggeration_is_possible(calibration):
+    with pytest.raises(ParameterError, match="expected at most") as refused:
+        draw_scene(calibration, exaggeration=1e6)
+    largest = float(str(refused.value).rpartition(" ")[2])
+    assert draw_scene(calibration, posture="x_max", exaggeration=largest).exaggeration == largest
+    with pytest.raises(ParameterError, match=f"expected at most {largest:.0f}$"):
+        draw_scene(calibration, posture="x_max", exaggeration=largest + 1.0)
 
 
 def test_arrows_at_one_contact_are_beside_each_other(scene):

@@ -212,7 +212,7 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
         posture: Name of a posture that replaces all stops.
 
     Returns:
-        The stops, and the number of omitted postures.
+        The stops, and the number of omitted stops.
 
     Raises:
         ParameterError: If the posture does not exist.
