@@ -751,13 +751,17 @@ def test_a_recording_that_continues_keeps_temperature_and_deleted_lines(folder, 
     assert "as typed before: 25 °C" in run(folder)[1]  # 18 °C was that of a corrected reading
 
 
-def test_setups_of_a_dial_have_no_brackets(folder, run):
+def test_setups_of_a_dial_and_gauges_have_no_brackets(folder, run):
     """They name the coordinates of points."""
     plan = (folder / "session.yaml").read_text()
-    (folder / "session.yaml").write_text(plan.replace("yx:", "'y[1]':"))
-    code, _, err = run(folder, "0.1")
-    assert code == 2
-    assert "setups.y[1]: has brackets; expected a name without them" in " ".join(err.split())
+    for changed, named in (
+        (plan.replace("yx:", "'y[1]':"), "setups.y[1]"),
+        (re.sub("gauge: (.*)", r"gauges: {'dial[1]': \1}", plan), "gauges.dial[1]"),
+    ):
+        (folder / "session.yaml").write_text(changed)
+        code, _, err = run(folder, "0.1")
+        assert code == 2
+        assert f"{named}: has brackets; expected a name without them" in " ".join(err.split())
 
 
 def test_unusual_temperatures_are_doubted_and_recorded(folder, run):

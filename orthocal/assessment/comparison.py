@@ -291,7 +291,9 @@ def _assess(comparison: Comparison) -> Assessment:
 def _models_not_recommended(
     recommendation: Recommendation, results: Sequence[ModelResult], best: ModelResult
 ) -> list[Finding]:
-    """Findings about the models that are not recommended."""
+    """Findings about the models that are not recommended; none if the recommended is missing."""
+    if best.model != recommendation.model:
+        return []
     return [
         words.not_recommended(
             r.model,

@@ -34,6 +34,7 @@ from orthocal.statistics.distributions import (
     f_tail,
     incomplete_beta,
     least_number,
+    log_chi_square_tail,
     median_of_largest,
 )
 from orthocal.statistics.information import square_root
@@ -231,15 +232,15 @@ def _find_worst_setup(residual: Array, along: Array, observations: Observations)
         observations: The entries.
     """
     information = along.T @ along + np.eye(along.shape[1])
-    probabilities: dict[int, float] = {}
+    log_probabilities: dict[int, float] = {}
     for setup in np.unique(observations.setup).tolist():
         entries = observations.setup == setup
         rows, r = along[entries], residual[entries]
         dof = int(entries.sum()) - observations.free_zeros_of(entries)
         fitted = np.linalg.solve(information - rows.T @ rows, rows.T @ r)
         decrease = float(r @ r + (rows.T @ r) @ fitted)
-        probabilities[setup] = chi_square_tail(dof, decrease) if dof else 1.0
-    return min(probabilities, key=lambda setup: probabilities[setup])
+        log_probabilities[setup] = log_chi_square_tail(dof, decrease) if dof else 0.0
+    return min(log_probabilities, key=lambda setup: log_probabilities[setup])
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,11 +26,11 @@ def median_of_largest(stds: Array) -> float:
     """Median of the largest absolute value of independent normal variables with mean 0.
 
     Args:
-        stds: Their standard deviations, shape (n,), positive.
+        stds: Their standard deviations, shape (n,). Variables without any are 0.
     """
     from scipy.special import erf
 
-    scales = math.sqrt(2.0) * stds
+    scales = math.sqrt(2.0) * stds[stds > 0.0]
     return least_number(lambda limit: float(np.prod(erf(limit / scales))) > 0.5)
 
 
@@ -72,6 +72,19 @@ def chi_square_tail(dof: float, value: float) -> float:
     from scipy.special import gammaincc
 
     return float(gammaincc(0.5 * dof, 0.5 * value))
+
+
+def log_chi_square_tail(dof: float, value: float) -> float:
+    """Logarithm of `chi_square_tail`, also where the probability is too small for a number.
+
+    There x = value/2 is much larger than a = dof/2, and Q(a, x) ≈ xᵃ exp(−x) / (Γ(a) (x − a + 1)),
+    the first convergent of the continued fraction.
+    """
+    tail = chi_square_tail(dof, value)
+    if tail > 0.0:
+        return math.log(tail)
+    a, x = 0.5 * dof, 0.5 * value
+    return a * math.log(x) - x - math.lgamma(a) - math.log(x - a + 1.0)
 
 
 def f_tail(dof: float, dof_below: float, value: float) -> float:

@@ -413,6 +413,20 @@ def test_a_free_zero_takes_a_degree_of_freedom_of_its_setup(raw_cycles):
     )
 
 
+@pytest.mark.parametrize(("squares", "worst"), [((2000.0, 3000.0), "zx"), ((3500.0, 3000.0), "yx")])
+def test_the_worst_setup_of_gross_mistakes(raw_cycles, squares, worst):
+    """All probabilities are below exp(-900): setups with 8 degrees of freedom, and with 1."""
+    chosen = [r for r in raw_cycles.readings if r.setup == "yx"]
+    chosen += [r for r in raw_cycles.readings if r.setup == "zx"][:2]
+    o = build_observations(raw_cycles.select(chosen))
+    residual = np.zeros(o.size)
+    for name, square in zip(("yx", "zx"), squares, strict=True):
+        own = np.array(o.zero_setup)[o.zero] == name
+        residual[np.flatnonzero(own)[:2]] = np.array([1.0, -1.0]) * np.sqrt(square / 2.0)
+    found = _find_worst_setup(residual, np.zeros((o.size, 1)), o)
+    assert list(raw_cycles.setups)[found] == worst
+
+
 def test_the_noise_that_several_sessions_share_counts_once(experiment_3):
     """Eight entries of each of two sessions, with eleven parameters and zeros: five checks."""
     session = session_of("table1/experiment-2")

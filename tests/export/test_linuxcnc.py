@@ -43,7 +43,7 @@ from orthocal.calibration.machine import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
 from orthocal.export.linuxcnc.drive_compensation import find_active_compensation, find_compensation
-from orthocal.export.linuxcnc.export import ExportOptions
+from orthocal.export.linuxcnc.export import ExportOptions, export_linuxcnc
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
 from orthocal.export.tool_tip import ToolTip
@@ -382,6 +382,24 @@ def test_bad_options_are_refused(offsets, tmp_path, words, code, message):
 
 
 # ---- HOME_OFFSET
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"latched": (1, 0, 1)}, "--latched: found 0; expected 1 or -1"),
+        ({"joint_limits": ((0.0, 1.0), (1.0, -1.0), (0.0, 1.0))}, "--ini: found limits 1 and -1"),
+        ({"joint_limits": ((0.0, np.nan),) * 3}, "--ini: found limits 0 and nan"),
+        ({"joint_limits": ((0.0, 1.0),)}, "--ini: found 1 range; expected 3"),
+        (
+            {"joint_limits": ((0.0, 1.0), (0.6, 0.7), (-1.0, 1.0))},
+            r"JOINT_1 \(y_slide\) has soft limits 600.000 mm to 700.000 mm; the travel .* is 2",
+        ),
+    ],
+)
+def test_limits_and_signs_that_cannot_be_are_refused(offsets, options, message):
+    with pytest.raises(ParameterError, match=message):
+        export_linuxcnc(offsets, ExportOptions(module=False, **options))
 
 
 def test_unknown_home_offsets_are_written_as_changes(offsets):

@@ -19,6 +19,7 @@ from orthocal import (
 )
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.calibration.identify import identify
+from orthocal.effects.compensation import JointTrim
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.loss import Loss
@@ -214,3 +215,23 @@ def test_a_fit_is_of_one_problem_where_the_noise_does_not_settle(root):
     prediction = fit.problem.predict(fit.solution.theta, fit.solution.passive)
     assert fit.prediction == pytest.approx(prediction, rel=1e-12)
     assert fit.program.problem is fit.problem
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda s: s.with_controller([1e-3, 2e-3, 0.5e-3]), "controller offsets"),
+        (lambda s: replace(s, compensation=(JointTrim(20e-6),) * 3), "compensation"),
+        (lambda s: replace(s, adjusted={"x_outer_foot_y": 0.1e-3}), "adjustments"),
+    ],
+)
+def test_a_file_has_one_state_of_machine_and_controller(sweep, tmp_path, change, named):
+    """It states them once, so that readings of the other setups would be read with wrong ones."""
+    joined = join_sessions([sweep, change(sweep.with_values(sweep.values))])
+    with pytest.raises(
+        SessionError, match=f"setup 'sweep-1/.*' with other {named} than the session"
+    ):
+        write_session(joined, tmp_path / "joined")
+    assert not (tmp_path / "joined").exists()
+    alike = join_sessions([change(sweep), change(sweep.with_values(sweep.values))])
+    write_session(alike, tmp_path / "alike")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.effects.compensation import JointTrim, compensates_alike
+from orthocal.export.linuxcnc import entered_lines
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.units import DEG
 
@@ -296,3 +298,18 @@ def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     export = f"`orthocal export {one} --to linuxcnc --offsets --ini FILE --out DIRECTORY`"
     assert f"Do not type them as HOME_OFFSET: {export} writes" in done.stdout
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
+
+
+def test_small_differences_are_shown_with_all_their_decimals(fivebar, monkeypatch):
+    """5 µrad are 0.0002865 degrees."""
+    monkeypatch.setattr(entered_lines, "_pair_trims", lambda *_: [])
+    entered = np.radians([0.1, 0.2])
+    stated = (entered + np.array([5e-6, 0.0])).tolist()
+    text = entered_lines.describe_other_lines(
+        SimpleNamespace(robot=fivebar), (), stated, entered=entered, file="joints.ini"
+    )
+    drive = fivebar.drives[0]
+    assert f"{drive.name} +0.1002865 deg instead of +0.1000000 deg." in text
+    pair = (drive, JointTrim(1.0e-3 * DEG), JointTrim(1.1e-3 * DEG))
+    text = entered_lines.compare_joints([pair])
+    assert text == "JOINT_0 has BACKLASH 0.0011000 deg instead of BACKLASH 0.0010000 deg"

@@ -12,6 +12,7 @@ from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
 
+import lxml.html
 import numpy as np
 import pytest
 from calibrated import UNJUDGED
@@ -42,6 +43,7 @@ from orthocal.measurement.motion.approach import (
 )
 from orthocal.measurement.motion.motion import plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
+from orthocal.output.sheet.page import sheet_files
 from orthocal.session.session import Conditions, Gauge, Reading
 from orthocal.units import MM
 
@@ -637,3 +639,33 @@ def test_a_path_returns_to_its_first_posture_from_either_side(bar):
     assert (again.stops[-1].role, again.stops[-1].posture) == ("return", "a")
     back = again.stops[-1].approach
     assert back not in (arrived[0], arrived[0].translate(str.maketrans("pn", "np")))
+
+
+def warnings_of(session):
+    """Expected readings of a sheet, and its warnings."""
+    page = lxml.html.fromstring(sheet_files(session)["sheet.html"])
+    shown = [row[-3].text_content() for row in page.xpath("//table[contains(@class,'boxes')]//tr")]
+    return shown[1:], [p.text_content() for p in page.xpath("//p[@class='warn']")]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "shown", "beyond"),
+    [
+        ((49.2, 50.8), ["-0.80", "+0.80", "-0.80"], ""),
+        ((51.4, 51.4), ["+1.40", "+1.40", "+1.40"], "+1.4 mm in line 2"),
+    ],
+)
+def test_expected_readings_of_a_known_zero_are_absolute(bar, lengths, shown, beyond):
+    """A bar of 50 mm with a range of ±1 mm: its readings are distances less 50 mm."""
+    postures = {
+        n: replace(bar.postures[n], values=p, drives=nominal_closure(bar.robot).inverse(p[None])[0])
+        for n, length, along in zip("ab", lengths, np.eye(3), strict=False)
+        for p in [(np.array([4.0, -3.0, -40.0]) + length * along) * MM]
+    }
+    gauges = {"": replace(bar.gauge, range=(-1.0 * MM, 1.0 * MM))}
+    rows = (Reading("bar", "a"), Reading("bar", "b"))
+    session = replace(bar, postures=postures, gauges=gauges, readings=rows)
+    expected, warnings = warnings_of(session)
+    assert [text.replace("−", "-") for text in expected] == shown
+    assert len(warnings) == 2 * bool(beyond)  # of the reading, and of the path
+    assert beyond in "".join(warnings).replace("−", "-")

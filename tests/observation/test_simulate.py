@@ -9,7 +9,7 @@ import pytest
 from gauges import exact
 from tolerances import KINEMATICS
 
-from orthocal import draw_errors, load_plan, load_session, simulate_session
+from orthocal import draw_errors, load_plan, load_session, simulate_session, write_session
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import build_problem
 from orthocal.observation.model import predict_readings
@@ -56,6 +56,12 @@ def test_one_seed_one_session(plan):
     a, b, c = (simulate_session(plan, ERRORS, seed=s).session.values for s in (1, 1, 2))
     assert np.array_equal(a, b)
     assert not np.array_equal(a, c)
+
+
+def test_files_state_the_seed_of_a_numpy_integer(plan, tmp_path):
+    session = simulate_session(plan, ERRORS, seed=np.int64(3)).session
+    write_session(session, tmp_path)
+    assert load_session(tmp_path).seed == 3
 
 
 def test_noise_zeros_and_rounding_are_as_asked(plan):

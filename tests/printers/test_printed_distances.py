@@ -50,6 +50,7 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.model import ObservationModel, predict_readings
+from orthocal.output.sheet.page import sheet_files
 from orthocal.sensors.protocol import equal_readings, states_readings
 from orthocal.units import MM
 
@@ -407,6 +408,9 @@ def test_rows_and_plans_state_pairs(tmp_path, printer):
         recording.repeat(0)
         recording.repeat(1)
     assert [r.cycle for r in load_plan(file).readings] == [1, 2, 2, 3]
+    # a pair is not a difference of two readings, for which the operator sets the dial to 0
+    with pytest.raises(SessionError, match=r"plan.yaml: setups.size: each reading .* two postures"):
+        sheet_files(planned)
     file.write_text(plan.replace("0.1}", "0.1, postures: [a, b, c]}"))
     with pytest.raises(SessionError, match="3 postures"):
         load_plan(file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from orthocal.statistics.distributions import (
     chi_square_tail,
     f_tail,
     incomplete_beta,
+    log_chi_square_tail,
     median_of_largest,
     normal_quantile,
     t_quantile,
@@ -38,6 +40,12 @@ def test_quantiles(share):
     assert t_quantile(1e8, share) == pytest.approx(normal_quantile(share), rel=1e-6)
 
 
+def test_constants_do_not_change_the_median_of_the_largest():
+    with warnings.catch_warnings(action="error"):
+        with_constant = median_of_largest(np.array([0.0, 2.0, 1.0]))
+    assert with_constant == median_of_largest(np.array([2.0, 1.0]))
+
+
 def test_distributions_at_their_ends():
     assert chi_square_tail(3.0, 0.0) == 1.0
     assert chi_square_tail(3.0, float("inf")) == chi_square_tail(0.0, 1.0) == 0.0
@@ -49,3 +57,13 @@ def test_the_median_of_the_largest_is_that_of_samples(stds):
     drawn = np.random.default_rng(1).normal(size=(40_000, len(stds))) * stds
     largest = np.abs(drawn).max(axis=1)
     assert median_of_largest(np.array(stds)) == pytest.approx(np.median(largest), rel=0.02)
+
+
+@pytest.mark.parametrize("value", [1.0, 1400.0, 2000.0, 1e6])
+def test_logarithms_of_tails_too_small_for_a_number(value):
+    """For an even number of degrees of freedom the tail is a finite sum."""
+    x = 0.5 * value
+    assert log_chi_square_tail(2.0, value) == pytest.approx(-x, **RELATIVE)
+    assert log_chi_square_tail(4.0, value) == pytest.approx(math.log1p(x) - x, rel=1e-8)
+    expected = math.log(1.0 + x + 0.5 * x**2) - x
+    assert log_chi_square_tail(6.0, value) == pytest.approx(expected, rel=1e-8)

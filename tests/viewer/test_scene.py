@@ -28,11 +28,17 @@ from orthocal import calibrate, draw_scene, load_robot, load_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.tool_error import assess_tool
 from orthocal.calibration.file import load_calibration, write_calibration
-from orthocal.errors import ParameterError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.files.session_file import load_plan
+from orthocal.measurement.joining import join_sessions
 from orthocal.observation.simulate import simulate_session
 from orthocal.output.scene import drawing, readings, tool_errors
-from orthocal.output.scene.deviations import measure_deviations, measurement_of_calibration
+from orthocal.output.scene.deviations import (
+    measure_deviations,
+    measurement_of_calibration,
+    measurement_of_session,
+)
+from orthocal.output.sheet.page import sheet_files
 from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.viewer import machine as machine_scene
 from orthocal.viewer.scene import FRAME_RATE, round_scale
@@ -338,6 +344,22 @@ def test_deviations_of_a_session_are_those_of_its_calibration(name):
         assert found[key] == pytest.approx(np.mean(values), abs=1e-10)
 
 
+def test_deviations_of_joined_sessions_are_those_of_each(raw_cycles):
+    """Each with its active offsets, and the nominal machine where its controller assumed it."""
+    second = raw_cycles.with_controller([1e-3, -2e-3, 0.5e-3])
+    joined = join_sessions([raw_cycles, second.with_values(second.values)])
+    found = [(d.setup.partition("/")[2], d.before) for d in measure_deviations(joined)]
+    alone = [(d.setup, d.before) for s in (raw_cycles, second) for d in measure_deviations(s)]
+    assert [setup for setup, _ in found] == [setup for setup, _ in alone]
+    assert [v for _, v in found] == pytest.approx([v for _, v in alone], abs=1e-12)
+    measured = measurement_of_session(joined)
+    for name, drives in measured.drives.items():
+        expected = raw_cycles.postures[name.partition("/")[2]].drives
+        assert drives + measured.active[name] == pytest.approx(expected, abs=1e-12)
+    with pytest.raises(SessionError, match="plan each session by itself"):
+        sheet_files(joined)
+
+
 def test_session_shows_the_nominal_machine_and_the_deviations(raw_cycles):
     scene = draw_scene(raw_cycles)
     assert links(scene, drawing.MACHINE)
@@ -418,7 +440,7 @@ def test_many_postures_are_thinned_out_for_the_animation(monkeypatch):
     monkeypatch.setattr("orthocal.output.scene.deviations.MAX_STOPS", 20)
     scene = draw_scene(session_of("sweep"))
     assert len(scene.steps) == 22
-    assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)
+    assert any("shows 20 of 30 stops" in fact for fact in scene.facts)
 
 
 def test_no_joint_leaps_between_two_frames(scene):
@@ -522,6 +544,15 @@ def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
 def test_exaggeration_must_be_positive(calibration, factor):
     with pytest.raises(ParameterError, match="expected a positive number"):
         draw_scene(calibration, exaggeration=factor)
+
+
+def test_the_stated_largest_exaggeration_is_possible(calibration):
+    with pytest.raises(ParameterError, match="expected at most") as refused:
+        draw_scene(calibration, exaggeration=1e6)
+    largest = float(str(refused.value).rpartition(" ")[2])
+    assert draw_scene(calibration, posture="x_max", exaggeration=largest).exaggeration == largest
+    with pytest.raises(ParameterError, match=f"expected at most {largest:.0f}$"):
+        draw_scene(calibration, posture="x_max", exaggeration=largest + 1.0)
 
 
 def test_arrows_at_one_contact_are_beside_each_other(scene):

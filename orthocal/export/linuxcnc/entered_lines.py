@@ -68,7 +68,7 @@ def describe_other_lines(
     if offsets is not None and not states_offsets(offsets, entered):
         values = joined(
             [
-                f"{d.name} {d.show(v, '+.3f')} instead of {d.show(e, '+.3f')}"
+                f"{d.name} {_show(d, v, e, '+')} instead of {_show(d, e, v, '+')}"
                 for d, v, e in zip(calibration.robot.drives, offsets, entered.tolist(), strict=True)
                 if abs(v - e) > SAME_OFFSET
             ]
@@ -121,5 +121,10 @@ def _describe(drive: Drive, trim: JointTrim, other: JointTrim) -> str:
         return "another table" if other.table is not None else "a table (COMP_FILE)"
     if not trim.backlash:
         return "BACKLASH 0 or none"
-    alike = drive.show(trim.backlash) == drive.show(other.backlash)
-    return f"BACKLASH {drive.show(trim.backlash, '.7f' if alike else '.3f')}"
+    return f"BACKLASH {_show(drive, trim.backlash, other.backlash)}"
+
+
+def _show(drive: Drive, value: float, other: float, sign: str = "") -> str:
+    """Value with its unit, with more decimals if three do not distinguish it from another one."""
+    alike = drive.show(value) == drive.show(other)
+    return drive.show(value, f"{sign}{'.7f' if alike else '.3f'}")

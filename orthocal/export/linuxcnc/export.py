@@ -92,6 +92,15 @@ class ExportOptions:
             require_tip(self.tool)
         if self.home_offsets is not None and not all(map(math.isfinite, self.home_offsets)):
             raise ParameterError("expected finite numbers", where="--home-offset")
+        for sign in self.latched or ():
+            if sign not in (-1, 1):
+                raise ParameterError(f"found {sign!r}; expected 1 or -1", where="--latched")
+        for low, high in self.joint_limits or ():
+            if not low < high:
+                raise ParameterError(
+                    f"found limits {low:g} and {high:g}; expected the lowest and the highest",
+                    where="--ini",
+                )
 
     @property
     def requested(self) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
+from orthocal.assessment.wording import counted
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
 from orthocal.export.linuxcnc.drive_compensation import JointCompensation
@@ -107,15 +108,12 @@ def find_homes(
             of these and of the robot's travel count, except for a stated limit at HOME_OFFSET.
 
     Raises:
-        ParameterError: If the numbers of old values and drives differ.
+        ParameterError: If the numbers of old values or limits and of drives differ, or stated
+            limits and travel exclude each other.
     """
     drives = calibration.robot.drives
-    if old is not None and len(old) != len(drives):
-        names = ", ".join(d.name for d in drives)
-        raise ParameterError(
-            f"found {len(old)} values; expected {len(drives)}, one for each of {names}",
-            where="--home-offset",
-        )
+    _require_one_each(drives, old, "value", "--home-offset")
+    _require_one_each(drives, stated_limits, "range", "--ini")
     entered = {e.drive for e in find_entries(calibration)}
     changes = offsets_to_enter(calibration) - calibration.active_offsets
     active = calibration.session.controller_offsets
@@ -125,7 +123,10 @@ def find_homes(
         limits = None if stated_limits is None else stated_limits[i]
         if active is not None:
             travel = np.array(d.joint_limits) + d.direction * active[i]
-            limits = _intersect(travel, limits, home)
+            common = _intersect(travel, limits, home)
+            if limits is not None and common[0] >= common[1]:
+                raise _no_common_position(f"JOINT_{i}", d, limits, travel)
+            limits = common
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
         home_changes = [0.0, 0.0]
         for k, opposite in enumerate((False, True)):
@@ -147,6 +148,36 @@ def find_homes(
             )
         )
     return tuple(homes)
+
+
+def _require_one_each(
+    drives: Sequence[Drive], values: Sequence[object] | None, noun: str, option: str
+) -> None:
+    """Refuse another number of values than of drives.
+
+    Raises:
+        ParameterError: If the numbers differ.
+    """
+    if values is not None and len(values) != len(drives):
+        names = ", ".join(d.name for d in drives)
+        raise ParameterError(
+            f"found {counted(len(values), noun)}; expected {len(drives)}, one for each of {names}",
+            where=option,
+        )
+
+
+def _no_common_position(
+    joint: str, drive: Drive, stated: tuple[float, float], travel: Array
+) -> ParameterError:
+    """Error for stated limits and a travel, shape (2,), without a common position, [unit]."""
+    limits, possible = (
+        f"{drive.show(low)} to {drive.show(high)}" for low, high in (stated, travel)
+    )
+    return ParameterError(
+        f"{joint} ({drive.name}) has soft limits {limits}; the travel of the drive is {possible}: "
+        "expected limits within the travel",
+        where="--ini",
+    )
 
 
 def _intersect(

@@ -25,17 +25,22 @@ from orthocal.units import MM, UM, tidy
 
 
 def split_points(session: Session) -> Session:
-    """Session whose setups of points are split into three."""
+    """Session whose setups of points are split into three.
+
+    Raises:
+        SessionError: If a name has brackets, which `base_name` removes.
+    """
     setups, gauges = {}, dict(session.gauges)
     for setup in session.setups.values():
         sensor = setup.sensor
         is_split = isinstance(sensor, Points) and sensor.along is not None
-        if not is_split and ("[" in setup.name or "]" in setup.name):
-            raise SessionError(
-                "has brackets; expected a name without them, because they name the coordinates of "
-                "points",
-                where=f"{session.path or 'session'}: setups.{setup.name}",
-            )
+        for key, name in (("setups", setup.name), ("gauges", setup.gauge)):
+            if not is_split and ("[" in name or "]" in name):
+                raise SessionError(
+                    "has brackets; expected a name without them, because they name the coordinates "
+                    "of points",
+                    where=f"{session.path or 'session'}: {key}.{name}",
+                )
         if is_split or not isinstance(sensor, Points):
             setups[setup.name] = setup
             continue

@@ -12,7 +12,8 @@ import numpy as np
 import yaml
 
 from orthocal.arguments import require_kind
-from orthocal.effects.compensation import format_table, table_name
+from orthocal.effects.adjustment import subtract_amounts
+from orthocal.effects.compensation import compensates_alike, format_table, table_name
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
 from orthocal.measurement.files.point_rows import (
@@ -39,16 +40,25 @@ from orthocal.session.points import base_name, gather_points, names_in_files
 from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DEG, MM, tidy, to_mm, trim_zeros
 
+SAME_OFFSET = 1e-9
+"""Largest difference between equal active offsets, [m, rad]."""
+
 
 def session_document(session: Session) -> dict[str, Any]:
-    """Content of the session.yaml of a session, as plain data."""
+    """Content of the session.yaml of a session, as plain data.
+
+    Raises:
+        SessionError: If setups differ in what a file states once; see `_payload` and
+            `_require_one_state`.
+    """
+    _require_one_state(session)
     document: dict[str, Any] = {"robot": session.robot_reference}
     if session.title:
         document["title"] = session.title
     if session.source:
         document["source"] = session.source
     if session.seed is not None:
-        document["seed"] = session.seed
+        document["seed"] = int(session.seed)
     gauges = {
         name: _gauge_document(g) for name, g in session.gauges.items() if base_name(name) == name
     }
@@ -117,6 +127,30 @@ def _payload(session: Session) -> float:
         listed = ", ".join(f"{v:g}" for v in sorted(payloads))
         raise SessionError(f"has setups under {listed} kg; a file has one payload_kg")
     return payloads.pop()
+
+
+def _require_one_state(session: Session) -> None:
+    """Refuse setups in other states of machine and controller than that of the session.
+
+    Raises:
+        SessionError: If there are such setups, as there may be after joining sessions.
+    """
+    for name, setup in session.setups.items():
+        state = {
+            "controller offsets": bool(
+                np.abs(session.active_during(name) - session.active_offsets).max() > SAME_OFFSET
+            ),
+            "compensation": setup.compensation is not None
+            and not compensates_alike(setup.compensation, session.compensation),
+            "adjustments": setup.adjusted is not None
+            and bool(subtract_amounts(setup.adjusted, session.adjusted)),
+        }
+        for key, differs in state.items():
+            if differs:
+                raise SessionError(
+                    f"has setup '{name}' with other {key} than the session states; a file states "
+                    "them once for all setups: write each session by itself"
+                )
 
 
 def _calibration_document(session: Session) -> dict[str, Any]:

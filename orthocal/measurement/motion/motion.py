@@ -39,7 +39,15 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import Contact, Sensor, ToolPath, has_dial, instrument, tool_path
+from orthocal.sensors.protocol import (
+    Contact,
+    Sensor,
+    ToolPath,
+    has_dial,
+    instrument,
+    reads_pairs,
+    tool_path,
+)
 from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
@@ -132,7 +140,8 @@ class Stop:
     lift: str = ""
     """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
     expected: float = 0.0
-    """Reading of the nominal machine, relative to the first reading, [m]."""
+    """Reading of the nominal machine, [m]; relative to the first reading unless the gauge zero is
+    known."""
     path: Array | None = None
     """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
     do not command the tool."""
@@ -191,8 +200,15 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
     """Plan the path through every setup, in the order of measurement.
 
     Raises:
-        SessionError: If there are too many readings, or a posture cannot be reached or approached.
+        SessionError: If sessions are joined, there are too many readings, a setup reads pairs of
+            postures, or a posture cannot be reached or approached.
     """
+    if session.joined:
+        raise SessionError(
+            "joins sessions, each with active offsets of its own; plan each session by itself",
+            where="session",
+        )
+    _refuse_pairs(session)
     if len(session.readings) > MOST_STOPS:
         raise SessionError(
             f"plans {len(session.readings)} readings; a sheet holds at most {MOST_STOPS}",
@@ -228,6 +244,22 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
     return tuple(motions)
 
 
+def _refuse_pairs(session: Session) -> None:
+    """Refuse setups whose readings belong to pairs of postures: no posture has a reading.
+
+    Raises:
+        SessionError: If there is such a setup; names the first.
+    """
+    for name in dict.fromkeys(r.setup for r in session.readings):
+        if reads_pairs(session.setups[name].sensor):
+            raise SessionError(
+                "each reading is taken between two postures; a sheet and programs stop in one "
+                "posture for each reading. Type these readings with `orthocal record`. For other "
+                "setups, run `orthocal sheet` on a session without this one",
+                where=f"{session.path or 'session'}: setups.{name}",
+            )
+
+
 def state_path_approaches(session: Session) -> Session:
     """Session whose readings state the approaches that follow from the paths of their sensors.
 
@@ -259,6 +291,18 @@ def dial_zero(gauge: Gauge) -> str:
     """Text of the reading in the middle of a gauge's range, to which its dial is set, in mm."""
     low, high = gauge.range or (0.0, 0.0)
     return f"{0.5 * (low + high) / MM + 0.0:g}"
+
+
+def range_of_expected(session: Session, setup: str) -> tuple[float, float]:
+    """Lowest and highest expected reading within the range of a setup's gauge, [m].
+
+    The first reading is in the middle of the range unless the gauge zero is known.
+    """
+    limits = session.gauges[session.setups[setup].gauge].range or (-np.inf, np.inf)
+    if session.setups[setup].zero == "known":
+        return limits
+    half = 0.5 * (limits[1] - limits[0])
+    return -half, half
 
 
 def set_dial(session: Session, setup: str) -> str:
@@ -654,21 +698,21 @@ def _predict(
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
-    relative = predicted - predicted[ends[first] - 1]
-    limits = session.gauges[session.setups[setup].gauge].range
-    half_range = np.inf if limits is None else 0.5 * (limits[1] - limits[0])
+    if session.setups[setup].zero != "known":
+        predicted = predicted - predicted[ends[first] - 1]
+    low, high = range_of_expected(session, setup)
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
         if i > 0:  # the gauge is mounted at the first stop
             start = end - len(paths[i].points)
-            on_path = relative[start:end]
+            on_path = predicted[start:end]
             problems = [p for p in contact.problems[start:end] if p]
             if problems or not np.isfinite(on_path).all():
                 lift = "the tip would leave the rod" if not problems else problems[0]
-            elif np.abs(on_path).max() > half_range:
-                largest = f"{on_path[np.abs(on_path).argmax()] / MM:+.1f}".replace("-", "−")
+            elif (excess := np.maximum(low - on_path, on_path - high)).max() > 0.0:
+                largest = f"{on_path[excess.argmax()] / MM:+.1f}".replace("-", "−")
                 lift = f"the dial would go {largest} mm"
-        expected = float(relative[end - 1])
+        expected = float(predicted[end - 1])
         finished.append(replace(stop, lift=lift, expected=expected, path=paths[i].drives))
     return finished

@@ -95,7 +95,7 @@ class Stop:
 
 
 def measure_deviations(session: Session) -> tuple[Deviation, ...]:
-    """Readings minus predictions of the nominal machine with the active offsets.
+    """Readings minus predictions of the nominal machine with the active offsets of each setup.
 
     Gauge zeros are fitted. Deviations of readings without a value are zero.
 
@@ -107,12 +107,16 @@ def measure_deviations(session: Session) -> tuple[Deviation, ...]:
     if rows.size:
         read = session.select([session.readings[i] for i in rows])
         observations = build_observations(read)
-        active = {
-            f"{drive.name}.offset": float(value)
-            for drive, value in zip(session.robot.drives, session.active_offsets, strict=True)
-            if value != 0.0
-        }
-        predicted = predict_readings(read, active, observations=observations)
+        active = [tuple(read.active_during(name).tolist()) for name in read.setups]
+        predicted = np.zeros(observations.size)
+        for offsets in set(active):
+            errors = {
+                f"{drive.name}.offset": value
+                for drive, value in zip(session.robot.drives, offsets, strict=True)
+                if value != 0.0
+            }
+            same = np.array([a == offsets for a in active])[observations.setup]
+            predicted[same] = predict_readings(read, errors, observations=observations)[same]
         entries = observations.values(read.values) - predicted
         deviations[rows] = observations.rows(project_out_zeros(entries, observations))
     return _average(
@@ -150,7 +154,12 @@ def measurement_of_session(session: Session) -> Measurement:
         setups=session.setups,
         drives={name: p.drives for name, p in session.postures.items()},
         offsets=np.asarray(session.active_offsets),
-        active={},
+        active={
+            name: session.active_during(r.setup)
+            for r in session.readings
+            for name in (r.posture, r.minus)
+            if name is not None
+        },
         rows=measure_deviations(session),
         count=len(session.readings),
         largest_after=None,
@@ -203,7 +212,7 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
         posture: Name of a posture that replaces all stops.
 
     Returns:
-        The stops, and the number of omitted postures.
+        The stops, and the number of omitted stops.
 
     Raises:
         ParameterError: If the posture does not exist.

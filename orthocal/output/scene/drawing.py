@@ -288,10 +288,11 @@ def _place_machines(
         exaggeration = round_scale(
             DEFAULT_DEVIATION * size / largest if largest > NEGLIGIBLE else 1.0
         )
-    if exaggeration * largest > MAX_DEVIATION * size:
+    limit = math.inf if largest == 0.0 else MAX_DEVIATION * size / largest
+    if exaggeration > limit:
         raise ParameterError(
             f"is {exaggeration:g}; the largest deviation of {largest / MM:.3g} mm would be drawn "
-            f"larger than the machine: expected at most {size / largest:.0f}",
+            f"larger than the machine: expected at most {math.floor(limit)}",
             where="exaggeration",
         )
     drawn = {name: exaggerate(nominal[name], real[name], exaggeration) for name in real}
@@ -328,11 +329,14 @@ def _follow(
 
 
 def _finish(scene: Scene, source: str, stops: Sequence[Stop], omitted: int) -> None:
-    """Add the animation, and facts about omitted postures and the source of the readings."""
+    """Add the animation, and facts about omitted stops and the source of the readings."""
     if len(stops) > 1:
         scene.animate()
     if omitted:
         shown = len(stops) - 2
-        scene.facts.append(f"The animation stops at {shown} of {shown + omitted} postures.")
+        scene.facts.append(
+            f"The animation shows {shown} of {shown + omitted} stops, which are the postures of "
+            "one measured part after another."
+        )
     if source:
         scene.facts.append(f"Source: {source}")

@@ -19,6 +19,7 @@ from orthocal.measurement.motion.motion import (
     Stop,
     guide,
     plan_motion,
+    range_of_expected,
     set_dial,
     shown_joints,
 )
@@ -357,16 +358,14 @@ def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> st
             f"The tip comes within {gauge.near_hinge / MM:.1f} mm of the middle of a hinge. Check "
             "that it clears the bearing before you set the gauge zero."
         )
-    limits = session.gauges[gauge.setup.gauge].range
-    if limits is not None:
-        half = 0.5 * (limits[1] - limits[0])
-        beyond = [s for s in motion.stops if s.role == "reading" and abs(s.expected) > half]
-        if beyond:
-            texts.append(
-                "Even a perfect machine shows "
-                f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {beyond[0].label}, "
-                "beyond the range of the dial. Choose another posture or another dial."
-            )
+    low, high = range_of_expected(session, motion.setup)
+    beyond = [s for s in motion.stops if s.role == "reading" and not low <= s.expected <= high]
+    if beyond:
+        texts.append(
+            "Even a perfect machine shows "
+            f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {beyond[0].label}, "
+            "beyond the range of the dial. Choose another posture or another dial."
+        )
     if motion.lifting:
         texts.append(motion.lifting)
     return "".join(paragraph(text, kind="warn") for text in texts)
