@@ -158,6 +158,10 @@ FORMS = [
     text("named-columns", "A;B;C\nxy;zero;0,00\nxy;x_max;-0,43\nyx;zero;1,5\n",
          columns={"setup": "A", "posture": "b", "reading": "#3"}, unit="mm"),
     text("fill", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\nyx;zero;1,5\n", fill=True),
+    text("fill-below-setups", "setup;posture;Wert mm\nxy;;\n;zero;0,00\n;x_max;-0,43\nyx;;\n"
+         ";zero;1,5\n", fill=True),
+    text("fill-below-postures", "posture;setup;Wert mm\nzero;;\n;xy;0,00\nx_max;;\n;xy;-0,43\n"
+         "zero;;\n;yx;1,5\n", fill=True),
     text("not-filled", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\n",
          "{}:3: has a reading but no setup; --fill copies the setup from the row above"),
     text("total", "setup;posture;Wert mm\nxy;zero;0,00\n;Summe:;-0,43\n",

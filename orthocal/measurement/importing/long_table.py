@@ -310,11 +310,12 @@ def _read_entries(
         unheaded = sum(not c.is_blank for c in row.cells[len(table.header) :])
         if unheaded:
             skipped.append((row.line, f"{unheaded} cells without a heading"))
-        if not filled_cells and not all(names[role] for role in name_roles):
+        complete = all(names[role] for role in name_roles)
+        if fill:  # also from a row that states a name only
+            names = above = {role: name or above[role] for role, name in names.items()}
+        if not filled_cells and not complete:
             skipped.append((row.line, NO_READING))
             continue
-        if fill:
-            names = above = {role: name or above[role] for role, name in names.items()}
         _require_names(table, row, names, name_roles)
         cells = _read_optional_cells(table, row, columns) | names
         for i, heading in _length_columns(columns, filled_cells).items():
