@@ -95,6 +95,7 @@ def test_backlash_as_written_is_the_same(size):
     ("old", "new", "where"),
     [
         ("LINEAR_UNITS = mm", "LINEAR_UNITS = inch", "[TRAJ]"),
+        ("BACKLASH = 0.031", "UNITS = INCH", "[JOINT_0]"),
         ("[JOINT_2]", "[JOINT_3]", "[JOINT_2]"),
         ("HOME_OFFSET = 340", "HOME_OFFSET = 340,0", "[JOINT_1]"),
         ("BACKLASH = 0.031", "BACKLASH = -0.031", "[JOINT_0]"),

@@ -28,8 +28,11 @@ EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{(offsets_[^{}]*)\}$")
 OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
 """Offsets of the drives with one unit in this comment."""
 
-METRIC_UNITS = ("mm", "metric")
-"""Values of LINEAR_UNITS with which lengths are in mm."""
+UNIT_KEYS = {"mm": "LINEAR_UNITS", "deg": "ANGULAR_UNITS"}
+"""Keys of [TRAJ] that state the unit of a drive, by this unit."""
+
+UNIT_WORDS = {"mm": ("mm", "metric"), "deg": ("deg", "degree")}
+"""Values of these keys that mean the unit of the drive, in lower case."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,17 +63,17 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         SessionError: If a COMP_FILE is wrong.
     """
     sections = _read_sections(path)
-    units = sections.get("TRAJ", {}).get("LINEAR_UNITS", "mm")
-    if units not in METRIC_UNITS:
-        raise ParameterError(f"LINEAR_UNITS is {units}; expected mm", where=f"{path}: [TRAJ]")
+    trajectory = sections.get("TRAJ", {})
     joints = []
     for i, drive in enumerate(robot.drives):
-        where = f"{path}: [JOINT_{i}]"
+        unit, where = drive.joint_unit, f"{path}: [JOINT_{i}]"
+        _require_unit(trajectory, UNIT_KEYS[unit], unit, f"{path}: [TRAJ]")
         keys = sections.get(f"JOINT_{i}")
         if keys is None:
             raise ParameterError(
                 f"the section is missing; it belongs to drive {drive.name}", where=where
             )
+        _require_unit(keys, "UNITS", unit, where)
         home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
         joints.append((home, _read_limits(keys, drive, where), latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
@@ -82,6 +85,17 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         trims,
         None if stated else _read_offsets(path, robot.drives),
     )
+
+
+def _require_unit(keys: Mapping[str, str], key: str, unit: str, where: str) -> None:
+    """Refuse a section that states another unit than that of a drive, mm or deg.
+
+    Raises:
+        ParameterError: If it does; names the key.
+    """
+    stated = keys.get(key)
+    if stated is not None and stated.casefold() not in UNIT_WORDS[unit]:
+        raise ParameterError(f"{key} is {stated}; expected {unit}", where=where)
 
 
 def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | None:
