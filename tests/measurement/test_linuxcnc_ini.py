@@ -111,6 +111,16 @@ def test_wrong_files_are_refused(folder, orthoglide, old, new, where):
     assert caught.value.where == f"{folder / 'machine.ini'}: {where}"
 
 
+def test_included_files_are_refused(folder, orthoglide):
+    """Their HOME_OFFSET would be read as 0."""
+    text = INI.replace("HOME_OFFSET = 340", "#INCLUDE y.inc")
+    (folder / "machine.ini").write_text(text)
+    with pytest.raises(ParameterError) as caught:
+        read_controller_joints(folder / "machine.ini", orthoglide)
+    line = text.splitlines().index("#INCLUDE y.inc") + 1
+    assert caught.value.where == f"{folder / 'machine.ini'}:{line}"
+
+
 @pytest.fixture(scope="module")
 def one(tmp_path_factory):
     """Directory of a calibration with backlash."""

@@ -171,10 +171,20 @@ def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[flo
 
 
 def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
-    """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC."""
+    """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC.
+
+    Raises:
+        ParameterError: If the file includes another one; names the line.
+    """
     sections = dict[str, dict[str, str]]()
     current = dict[str, str]()
-    for line in read_text(path, error=ParameterError).splitlines():
+    text = read_text(path, error=ParameterError)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.lstrip().startswith("#INCLUDE"):
+            raise ParameterError(
+                "#INCLUDE is not supported; replace it by the lines of the included file",
+                where=f"{path}:{number}",
+            )
         bare = re.sub(r"(^|\s)[#;].*", "", line).strip()  # without its comment
         if bare.startswith("[") and bare.endswith("]"):
             current = sections.setdefault(bare[1:-1].strip(), {})
