@@ -172,6 +172,21 @@ def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
     assert "--latched" in twice.stderr
 
 
+def test_a_fragment_of_changes_states_no_home_offset(folder, one, plain):
+    """As exported without HOME_OFFSET; then the option states it."""
+    lines = [v for v in plain.read_text().splitlines() if not v.startswith("HOME_")]
+    (folder / "changes.ini").write_text("\n".join(lines))
+    home = ["--home-offset", "352.5,340,-3.25"]
+    for name, words in (("no-file", []), ("stated", home)):
+        assert export(folder, one, name, *words).returncode == 0
+        done = export(folder, one, f"{name}-ini", "--ini", "changes.ini", *words)
+        assert done.returncode == 0, done.stderr
+        texts = [(folder / n / "joints.ini").read_text() for n in (name, f"{name}-ini")]
+        entered = [re.findall(r"^(?:# )?HOME_OFFSET = .*", text, re.M) for text in texts]
+        assert entered[0] == entered[1]
+        assert len(entered[0]) == 3
+
+
 def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
     """They are positions of the slide, which change with the offset; wider ones do not count."""
     own = "[JOINT_1]\nMIN_LIMIT = 160\nMAX_LIMIT = 999\n"

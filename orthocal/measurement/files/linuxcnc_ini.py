@@ -39,8 +39,9 @@ UNIT_WORDS = {"mm": ("mm", "metric"), "deg": ("deg", "degree")}
 class ControllerJoints:
     """Joints of a controller, in the order of the drives."""
 
-    home_offsets: tuple[float, ...]
-    """HOME_OFFSET, [m, rad]."""
+    home_offsets: tuple[float, ...] | None
+    """HOME_OFFSET, [m, rad]; None if no joint states it or HOME_LATCH_VEL, as in a fragment that
+    states changes only."""
     limits: tuple[tuple[float, float], ...]
     """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
     latched: tuple[int, ...] | None
@@ -78,8 +79,9 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         joints.append((home, _read_limits(keys, drive, where), latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
+    known = stated or any(home is not None for home in homes)
     return ControllerJoints(
-        homes,
+        tuple(home or 0.0 for home in homes) if known else None,
         limits,
         tuple(latch or 1 for latch in latched) if stated else None,
         trims,
@@ -114,8 +116,10 @@ def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | No
 
 def _read_joint(
     keys: Mapping[str, str], drive: Drive, *, folder: Path, where: str
-) -> tuple[float, int | None, JointTrim]:
+) -> tuple[float | None, int | None, JointTrim]:
     """Home offset, [m, rad], sign of HOME_LATCH_VEL and compensation of a joint.
+
+    Home offset and sign are None if not stated.
 
     Args:
         keys: Keys of its section.
@@ -147,7 +151,8 @@ def _read_joint(
     latch = None
     if "HOME_LATCH_VEL" in keys:
         latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
-    return numbers["HOME_OFFSET"] * factor, latch, JointTrim(numbers["BACKLASH"] * factor, table)
+    home = numbers["HOME_OFFSET"] * factor if "HOME_OFFSET" in keys else None
+    return home, latch, JointTrim(numbers["BACKLASH"] * factor, table)
 
 
 def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[float, float]:
