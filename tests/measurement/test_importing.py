@@ -598,6 +598,25 @@ def test_temperatures_of_a_table(heading, cells, expected, session):
     assert loaded == expected
 
 
+def test_merged_cells_of_conditions_apply_to_all_their_rows(session):
+    conditions = ["approach", "temperature_C", "time"], ["pp", 21.5, "2025-03-14T09:26:00"]
+    head, first, second, third = CELLS
+    rows = [[*head, *conditions[0]], [*first, *conditions[1]], second, third]
+
+    def merge_conditions(made):
+        for column in "DEF":
+            made.worksheets[0].merge_cells(f"{column}2:{column}3")
+
+    found = read(session, book("merged", rows, edit=merge_conditions))
+    assert not isinstance(found, str), found
+    *merged, other = [r.conditions for r in load_session(session).readings]
+    assert other is None
+    for read_back in merged:
+        assert read_back.approach == "pp"
+        assert read_back.temperature == 21.5
+        assert read_back.time == datetime.datetime.fromisoformat(conditions[1][2])
+
+
 def test_times_of_a_table(session):
     """Dates of German tables too; clock times alone are no column of a session."""
     times = ("14.03.2025 9:26", "14.3.2025 09:28:10", "2025-03-14 09:30")

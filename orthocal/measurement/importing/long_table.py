@@ -339,7 +339,7 @@ def _without_units_row(
     table: Table, columns: Columns, skipped: SkippedRows
 ) -> tuple[Iterable[Row], dict[int, UnitName]]:
     """Rows below the headings without a row of units, and these units by column."""
-    rows = table.fill_merged(columns.keys)
+    rows = table.fill_merged(columns.single.values())
     for first in rows:
         units = _read_units_row(first, columns)
         if not units:
