@@ -352,6 +352,8 @@ def _without_units_row(
 def _length_columns(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:
     """Columns of lengths that belong to a row: those of its point, or of its readings.
 
+    A reading beside a point remains, so that the row is refused.
+
     Args:
         columns: Roles of the columns.
         filled: Indices of the columns with a number in this row.
@@ -360,7 +362,7 @@ def _length_columns(columns: Columns, filled: Sequence[int]) -> dict[int, Headin
     if not filled:
         is_point = not any(h.role == "reading" for h in columns.readings.values())
     excluded: tuple[Role, ...] = ("reading",) if is_point else POINT
-    return {i: h for i, h in columns.readings.items() if h.role not in excluded}
+    return {i: h for i, h in columns.readings.items() if h.role not in excluded or i in filled}
 
 
 def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, str]:
