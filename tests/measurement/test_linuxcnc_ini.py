@@ -67,6 +67,16 @@ def test_joints_are_read(folder, orthoglide):
     )
 
 
+def test_limits_that_limit_nothing_are_infinite(folder, orthoglide):
+    """LinuxCNC's defaults are -1e99 and 1e99."""
+    limits = "[JOINT_0]\nMIN_LIMIT = -1e99\nMAX_LIMIT = 1e99\n"
+    text = INI.replace("[JOINT_0]\n", limits).replace("[JOINT_1]\n", "[JOINT_1]\nMIN_LIMIT = 5\n")
+    (folder / "machine.ini").write_text(text)
+    unlimited = (-np.inf, np.inf)
+    found = read_controller_joints(folder / "machine.ini", orthoglide).limits
+    assert found == (unlimited, (5 * MM, np.inf), unlimited)
+
+
 def test_lines_of_an_export_state_no_direction_of_latching(folder, orthoglide):
     """Which is then assumed and noted, instead of read as positive."""
     lines = [v for v in INI.splitlines() if not v.startswith("HOME_LATCH")]
@@ -101,6 +111,8 @@ def test_backlash_as_written_is_the_same(size):
         ("BACKLASH = 0.031", "BACKLASH = -0.031", "[JOINT_0]"),
         ("COMP_FILE_TYPE = 1", "COMP_FILE_TYPE = 0", "[JOINT_2]"),
         ("BACKLASH = 0.2", "MIN_LIMIT = 70\nMAX_LIMIT = -150", "[JOINT_2]"),
+        ("BACKLASH = 0.2", "MIN_LIMIT = 1e99\nMAX_LIMIT = 1e99", "[JOINT_2]"),
+        ("BACKLASH = 0.2", "BACKLASH = 1e99", "[JOINT_2]"),
     ],
 )
 def test_wrong_files_are_refused(folder, orthoglide, old, new, where):

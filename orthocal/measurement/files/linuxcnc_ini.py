@@ -13,7 +13,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.effects.compensation import MAX_COMP_FILE_ENTRIES, Compensation, JointTrim
 from orthocal.errors import ParameterError, SessionError
-from orthocal.io.documents import parse_number, read_text
+from orthocal.io.documents import LARGEST_NUMBER, parse_number, read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
 from orthocal.measurement.files.session_keys import LARGEST_TRIM
@@ -158,14 +158,19 @@ def _read_joint(
 def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[float, float]:
     """MIN_LIMIT and MAX_LIMIT of a joint, [m, rad]; infinite if not stated.
 
+    Numbers beyond LARGEST_NUMBER are infinite, too: for LinuxCNC, ±1e99 means no limit.
+
     Raises:
         ParameterError: If one is no number, or the lowest is above the highest.
     """
     factor = drive.joint_size
-    low, high = (
-        parse_number(keys[key], where=where, name=key, error=ParameterError) if key in keys else end
-        for key, end in (("MIN_LIMIT", -math.inf), ("MAX_LIMIT", math.inf))
+    stated = (
+        parse_number(
+            keys.get(key, default), where=where, name=key, error=ParameterError, largest=math.inf
+        )
+        for key, default in (("MIN_LIMIT", "-1e99"), ("MAX_LIMIT", "1e99"))
     )
+    low, high = (v if abs(v) <= LARGEST_NUMBER else math.copysign(math.inf, v) for v in stated)
     if low >= high:
         raise ParameterError(
             f"MIN_LIMIT is {low:g} {drive.joint_unit}, not below MAX_LIMIT, "
