@@ -580,6 +580,7 @@ xy,x_max,1,,nn
     [
         ("temperature_C", ("21.5", "", "22"), [21.5, None, 22.0]),
         ("Temperatur [°C]", ("21,5", "−1", "22 °C"), [21.5, -1.0, 22.0]),
+        ("Temperatur [°C]", ("21,5", "-", "–"), [21.5, None, None]),
         ("temperature", ("70 °F", "21", "68 deg F"), [21.111, 21.0, 20.0]),
         ("Temperature (F)", ("70", "68", "21 °C"), [21.111, 20.0, 21.0]),
         ("temp", ("20", "70", ""), "the temperature '70' may be in °C or °F"),

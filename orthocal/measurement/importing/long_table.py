@@ -381,12 +381,14 @@ def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, 
 
 
 def _read_temperature(table: Table, row: Row, column: int) -> str:
-    """Temperature of a row in °C; text that is not a number is returned unchanged.
+    """Temperature of a row in °C; empty for a dash.
+
+    Other text that is not a number is returned unchanged.
 
     Raises:
         SessionError: If the temperature may be in °C or °F.
     """
-    text = row.cell(column).text.strip()
+    text = _name(row.cell(column))
     number, unit = split_degrees(text)
     degrees = unit or split_degrees(table.header[column])[1]
     value = parse_numeral(number.strip(), "comma" if "," in number else "point")
