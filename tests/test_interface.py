@@ -169,6 +169,7 @@ def test_arguments_of_calibrate(arguments, message, experiment_2):
         {"hessian": "x"},
         {"tolerance": 0},
         {"tolerance": "a"},
+        pytest.param({"tolerance": 10**400}, id="tolerance beyond all floats"),
         {"closure_tolerance": float("nan")},
         {"max_iterations": "a"},
         {"max_iterations": -1},

@@ -81,7 +81,8 @@ def export(
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
-        home_offsets=joints.home_offsets if joints else _home_offsets(home_offset, result),
+        home_offsets=(joints.home_offsets if joints else None)
+        or _home_offsets(home_offset, result),
         latched=(joints.latched if joints else None) or _signs(latched),
         joint_limits=joints.limits if joints else None,
         half_side=None if half_side_mm is None else half_side_mm * MM,
@@ -189,8 +190,9 @@ def _read_joints(
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     joints = read_controller_joints(path, calibration.robot)
+    in_file = {"--home-offset": joints.home_offsets, "--latched": joints.latched}
     for option, value in stated.items():
-        if value is not None and (option != "--latched" or joints.latched is not None):
+        if value is not None and in_file[option] is not None:
             raise ParameterError("is stated by --ini, too; state one of them", where=option)
     drives, stated_trims = calibration.robot.drives, calibration.session.compensation
     expected = stated_trims or (JointTrim(),) * len(drives)

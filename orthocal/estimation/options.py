@@ -70,9 +70,7 @@ class SolverOptions:
         require_kind(self.loss, Loss, expected="Loss(...)")
         for name in ("tolerance", "closure_tolerance"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not (
-                isinstance(value, Real) and 0.0 < float(value) < math.inf
-            ):
+            if not _is_positive(value):
                 raise ValueError(f"{name} is {value!r}; expected a number above 0")
         limits = {"max_iterations": LARGEST_MAX_ITERATIONS, "print_level": LARGEST_PRINT_LEVEL}
         for name, largest in limits.items():
@@ -91,6 +89,16 @@ class SolverOptions:
         object.__setattr__(self, "ipopt", dict(self.ipopt))
         _require_one_of(self.hessian, get_args(Hessian), "Hessian", ValueError)
         _require_one_of(self.solver, get_args(SolverKind), "solver", OrthocalError)
+
+
+def _is_positive(value: object) -> bool:
+    """True for a finite number above 0."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    try:
+        return 0.0 < float(value) < math.inf
+    except OverflowError:  # an integer beyond all floats
+        return False
 
 
 def _require_one_of(

@@ -21,7 +21,7 @@ from orthocal.hypotheses.likelihood import Products, log_of_sum
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.hypotheses.pairs import Singles, find_pairs
-from orthocal.hypotheses.set_evaluation import marks, prior_of
+from orthocal.hypotheses.set_evaluation import marks, prior_of, score_silent
 
 CLEAR_LOG_BAYES = 7.0
 """Smallest log Bayes factor of a reported anomaly. By chance at most one of e⁷ = 1,100 sessions
@@ -81,7 +81,7 @@ class FamilyScorer:
         likelihood = state.about.likelihood
         deviation = state.remaining
         base = likelihood.products(deviation[None])
-        sound, n_rows = float(likelihood.score(base)[0]), self._n_rows
+        sound = float(likelihood.score(base)[0])
         for family in families:
             if family.groups:
                 logs = np.array(
@@ -106,10 +106,7 @@ class FamilyScorer:
             elif family.silent:
                 logs = np.array(
                     [
-                        likelihood.score_set(
-                            deviation,
-                            silent=self.model.entries(marks(list(rows[:, None]), n_rows)),
-                        ).log_likelihood
+                        score_silent(self.model, likelihood, deviation, rows)[0].log_likelihood
                         for rows in family.silent
                     ]
                 )

@@ -8,14 +8,14 @@ has the same r principal directions for all e and s. So any number of corrected 
 by products with these directions.
 
 An effect of unknown amount, b w with b ~ N(0, τ²), is integrated over b in closed form and averaged
-over a grid of τ. A row without information has an effect with a flat prior.
+over a grid of τ. Rows without information are removed from all vectors (`restricted`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -85,7 +85,7 @@ class Score:
     tolerance_scale: float
     noise_scale: float
     amounts: Array
-    """Amounts of all effects, silent rows last, shape (k,), [m]."""
+    """Amounts of all effects, shape (k,), [m]."""
     stds: Array
     """Standard deviations of the amounts, shape (k,), [m]."""
 
@@ -197,7 +197,6 @@ class Likelihood:
         self,
         deviation: Array,
         groups: Sequence[Array] = (),
-        silent: Array | None = None,
         *,
         priors: Sequence[AmountPrior | None] = (),
     ) -> Score:
@@ -207,16 +206,14 @@ class Likelihood:
             deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             groups: Effects per unit, zeros projected out, (k, n_entries) each; the amounts of a
                 group share one prior standard deviation τ.
-            silent: Indicators of rows without information, zeros projected out, (m, n_entries).
             priors: Prior of the amounts of each group; None for a normal prior with τ on the grid
                 AMOUNT_STDS.
         """
         logs = self.log_densities(self.products(deviation[None]))[0] + self.weights
         sizes = [len(g) for g in groups]
-        n_silent = 0 if silent is None else len(silent)
-        if not sum(sizes) + n_silent:
+        if not sum(sizes):
             return self._best(logs, np.zeros((logs.size, 0)), np.zeros((logs.size, 0, 0)))
-        vectors = np.concatenate([*groups, *([] if silent is None else [silent])])
+        vectors = np.concatenate(list(groups))
         gram, slope = self._gram(deviation, vectors)
         group_priors = list(priors) or [None] * len(groups)
         grid = _grid_of_stds(
@@ -226,12 +223,9 @@ class Likelihood:
             np.zeros(k, bool) if p is None else p.positive
             for p, k in zip(group_priors, sizes, strict=True)
         ]
-        positive = np.concatenate([*positive_by_group, np.zeros(n_silent, bool)])
-        group_precision = np.repeat(np.array(grid) ** -2.0, sizes, axis=1)
-        precision = np.hstack([group_precision, np.zeros((len(grid), n_silent))])
-        gains = _integrate_amounts(gram, slope, precision, positive)
+        precision = np.repeat(np.array(grid) ** -2.0, sizes, axis=1)
+        gains = _integrate_amounts(gram, slope, precision, np.concatenate(positive_by_group))
         evidence = logs + log_of_sum(gains, axis=0) - np.log(len(grid))
-        evidence = evidence + 0.5 * n_silent * np.log(2.0 * np.pi)
         # an effect without influence on the entries has the amount 0 and a huge standard deviation
         floor = 1e-12 * np.trace(gram, axis1=1, axis2=2) + (LARGEST_AMOUNT * self.sigma) ** -2
         gram = gram + floor[:, None, None] * np.eye(len(vectors))
@@ -239,8 +233,42 @@ class Likelihood:
         given_precision = [
             t**-2.0 if p else 0.0 for p, t in zip(group_priors, likeliest_stds, strict=True)
         ]
-        gram = gram + np.diag(np.append(np.repeat(given_precision, sizes), np.zeros(n_silent)))
+        gram = gram + np.diag(np.repeat(given_precision, sizes))
         return self._best(evidence, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
+
+    def restricted(self, restrict: Callable[[Array], Array], n_silent: int) -> Likelihood:
+        """Likelihood of the entries with information.
+
+        Args:
+            restrict: Orthogonal projection of vectors, shape (h, n_entries), onto those without the
+                silent entries and without zeros.
+            n_silent: Number of silent entries.
+        """
+        jacobian = restrict(np.sqrt(self.variances)[:, None] * self.directions).T
+        dof = self.dof - n_silent
+        other, _, _ = build_likelihood(jacobian, sigma=self.sigma, dof=dof, stated=True)
+        return replace(other, weights=self.weights)
+
+    def predict(self, deviation: Array, restricted: Likelihood, score: Score) -> Array:
+        """Expected deviation of all entries by that of the entries with information, (n_entries,).
+
+        With the restricted covariance V' it is V V'⁻¹ d, at the most likely scales.
+
+        Args:
+            deviation: Restricted deviation d without effects, shape (n_entries,), [m].
+            restricted: The restricted likelihood.
+            score: Its score.
+        """
+        scales = np.array([score.tolerance_scale]), np.array([score.noise_scale])
+        noise, variance = self.grid(*scales)
+        directions = restricted.directions
+        along = directions @ deviation
+        weights = 1.0 / restricted.grid(*scales)[1][:, 0] - 1.0 / noise
+        weighted = deviation / noise + (weights * along) @ directions
+        return np.asarray(
+            noise * weighted
+            + ((variance[:, 0] - noise) * (self.directions @ weighted)) @ self.directions
+        )
 
     def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:
         """Score with the amounts of the most likely pair (e, s).

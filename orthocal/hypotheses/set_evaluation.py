@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.hypothesis import (
     MachineShift,
     SystematicEffect,
@@ -21,7 +21,7 @@ from orthocal.hypotheses.hypothesis_set import (
     correct_rows,
     split_amounts,
 )
-from orthocal.hypotheses.likelihood import AmountPrior
+from orthocal.hypotheses.likelihood import AmountPrior, Likelihood, Score
 from orthocal.hypotheses.linear_model import (
     LARGEST_ERROR,
     MAX_RELINEARISATIONS,
@@ -29,6 +29,7 @@ from orthocal.hypotheses.linear_model import (
     LinearModel,
 )
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
+from orthocal.statistics.zeros import project_out_zeros
 
 EFFECT_SCALES = np.array([1.0, 4.0])
 """Grid of amplitudes of the parameters of an effect, [prior std]."""
@@ -165,16 +166,22 @@ class SetEvaluator:
             applied: Amounts of the unknown machine shifts that the linearisation contains, (n,).
         """
         rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
-        groups, silent, steps = self._vectors(terms, about)
+        groups, steps = self._vectors(terms, about)
+        silent = [t.silent for t in terms if t.silent is not None]
         priors = [
             None if t.systematic is None else prior_of(t.systematic)
             for t in terms
             if t.effects is not None or (t.shift is not None and not t.known)
         ]
         deviation = self.model.entries(rows[None])[0] - about.expected + applied @ steps
-        score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
-        effects = [*groups, *([] if silent is None else [silent])]
-        remaining = deviation - (score.amounts @ np.concatenate(effects) if effects else 0.0)
+        if silent:
+            rows_without = np.concatenate(silent)
+            score, remaining = score_silent(
+                self.model, about.likelihood, deviation, rows_without, groups, priors=priors
+            )
+        else:
+            score = about.likelihood.score_set(deviation, groups, priors=priors)
+            remaining = deviation - (score.amounts @ np.concatenate(groups) if groups else 0.0)
         amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
         changes = [
             abs(a[0]) * np.abs(t.shift.direction).max()
@@ -189,27 +196,75 @@ class SetEvaluator:
 
     def _vectors(
         self, terms: Sequence[Term], about: ModelLinearisation
-    ) -> tuple[list[Array], Array | None, Array]:
+    ) -> tuple[list[Array], Array]:
         """Effects of the terms on the entries, zeros projected out.
 
         Returns:
-            Effects of each term, (k, n_entries) each; indicators of silent rows, (m, n_entries), or
-            None; and effects of unknown shifts, (n, n_entries).
+            Effects of each term, (k, n_entries) each; and effects of unknown shifts,
+            (n, n_entries).
         """
-        model, groups, silent, steps = self.model, [], [], []
+        model, groups, steps = self.model, [], []
         for t in terms:
             if t.effects is not None:
                 groups.append(model.entries(t.effects))
             elif t.shift is not None and not t.known:
                 groups.append(model.shift_entries(about, t.shift)[None])
                 steps.append(groups[-1][0])
-            elif t.silent is not None:
-                silent.append(model.entries(marks(list(t.silent[:, None]), self.values.size)))
-        return (
-            groups,
-            np.concatenate(silent) if silent else None,
-            np.array(steps).reshape(len(steps), -1 if steps else about.expected.size),
-        )
+        return groups, np.array(steps).reshape(len(steps), -1 if steps else about.expected.size)
+
+
+def score_silent(
+    model: LinearModel,
+    likelihood: Likelihood,
+    deviation: Array,
+    silent: Indices,
+    groups: Sequence[Array] = (),
+    *,
+    priors: Sequence[AmountPrior | None] = (),
+) -> tuple[Score, Array]:
+    """Marginal likelihood of the other rows, if some single rows have no information.
+
+    Args:
+        model: The model.
+        likelihood: Likelihood of all entries.
+        deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
+        silent: Rows without information.
+        groups: Effects per unit, zeros projected out, (k, n_entries) each.
+        priors: Prior of the amounts of each group, as in `Likelihood.score_set`.
+
+    Returns:
+        The score, with the errors of the silent rows, [m], behind the amounts; and the deviation
+        without effects and errors, shape (n_entries,), [m].
+    """
+    o, ratio = model.problem.observations, model.problem.noise_ratio
+    entries = o.plus[silent]
+    informative = np.ones(o.size)
+    informative[entries] = 0.0
+
+    def restrict(vectors: Array) -> Array:
+        return np.asarray(project_out_zeros(vectors.T, o, weights=informative).T * informative)
+
+    restricted = likelihood.restricted(restrict, entries.size)
+    score = restricted.score_set(
+        restrict(deviation[None])[0], [restrict(g) for g in groups], priors=priors
+    )
+    corrected = deviation - (score.amounts @ np.concatenate(groups) if groups else 0.0)
+    remaining = likelihood.predict(restrict(corrected[None])[0], restricted, score)
+    errors = project_out_zeros(corrected - remaining, o, weights=informative)[entries]
+    errors = errors * ratio[entries]
+    # volumes of the removed coordinates: the noise ratios, and the shares of the zeros that remain
+    totals = np.bincount(o.zero, minlength=o.n_zeros)
+    shares = np.bincount(o.zero, informative, minlength=o.n_zeros) / np.maximum(totals, 1)
+    shares = shares[~o.zero_known & (shares > 0.0)]
+    volume = np.log(ratio[entries]).sum() - 0.5 * np.log(shares).sum()
+    log_likelihood = score.log_likelihood + volume + 0.5 * entries.size * np.log(2.0 * np.pi)
+    score = replace(
+        score,
+        log_likelihood=float(log_likelihood),
+        amounts=np.append(score.amounts, errors),
+        stds=np.append(score.stds, np.full(entries.size, np.inf)),
+    )
+    return score, remaining
 
 
 def _without_likelihood(state: HypothesisSet) -> HypothesisSet:

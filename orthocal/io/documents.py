@@ -331,12 +331,19 @@ def _header_problem(
 _DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf\w*)", re.I)
 
 
-def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]) -> float:
+def parse_number(
+    text: str,
+    *,
+    where: str,
+    name: str,
+    error: type[OrthocalError],
+    largest: float = LARGEST_NUMBER,
+) -> float:
     """Finite number in a CSV field.
 
     Raises:
         OrthocalError: Of kind `error`, for other text, NaN, infinity, a decimal comma or a number
-            beyond LARGEST_NUMBER.
+            beyond `largest`.
     """
     try:
         if len(text) > LONGEST_NUMBER or not _DECIMAL.fullmatch(text):
@@ -347,10 +354,8 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
         raise error(f"{name} is '{shorten(text)}'; expected a number{hint}", where=where) from None
     if value - value != 0.0:
         raise error(f"{name} is '{text}'; expected a finite number", where=where)
-    if abs(value) > LARGEST_NUMBER:
-        raise error(
-            f"{name} is '{text}'; expected a number within ±{LARGEST_NUMBER:g}", where=where
-        )
+    if abs(value) > largest:
+        raise error(f"{name} is '{text}'; expected a number within ±{largest:g}", where=where)
     return value
 
 

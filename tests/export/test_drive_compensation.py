@@ -281,6 +281,36 @@ def test_latch_direction_is_positive_by_default(calibration):
     assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3
 
 
+@pytest.mark.parametrize("end", [0, 1])
+def test_limits_contain_the_home_offset_of_either_latch_direction(calibration, end):
+    """Also if the switch is at a limit, from where backlash displaces HOME_OFFSET."""
+    active = calibration.session.controller_offsets
+    switches = tuple(
+        d.joint_limits[end] + d.direction * offset
+        for d, offset in zip(calibration.robot.drives, active, strict=True)
+    )
+
+    def lines(latched):
+        options = ExportOptions(home_offsets=switches, latched=latched, module=False)
+        return export_calibration(calibration, "linuxcnc", anyway=True, options=options)[
+            "joints.ini"
+        ]
+
+    default = lines(None)
+    for prefix, latched in (("", (1, 1, 1)), (r"(?:.* negative: )", (-1, -1, -1))):
+        for i, section in enumerate(default.split("[JOINT_")[1:]):
+            read = {
+                key: re.findall(rf"(?m)^{prefix}{key} = (\S+)", section)
+                or re.findall(rf"(?m)^{key} = (\S+)", section)
+                for key in ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")
+            }
+            low, home, high = (float(v[0]) for v in read.values())
+            assert low <= home <= high
+            stated = lines(latched).split("[JOINT_")[i + 1]
+            for key, found in read.items():
+                assert re.findall(rf"(?m)^{key} = (\S+)", stated) == found
+
+
 def enter_export(calibration, folder, options):
     """Session of a calibration with its export entered into the controller, and the files."""
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)

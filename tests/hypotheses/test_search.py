@@ -30,8 +30,10 @@ from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.families.wrong_readings import wrong_readings
 from orthocal.hypotheses.hypothesis import MAX_DENSE_COLUMNS, Rows, to_dense
-from orthocal.hypotheses.linear_model import LARGEST_ERROR, LinearModel
+from orthocal.hypotheses.likelihood import AmountPrior
+from orthocal.hypotheses.linear_model import LARGEST_ERROR, LinearModel, linear_model
 from orthocal.hypotheses.search import find_anomalies
+from orthocal.hypotheses.set_evaluation import score_silent
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.first_plan import paper_plan
 
@@ -225,6 +227,30 @@ def test_the_evidence_of_a_stuck_dial_does_not_depend_on_the_order_of_the_gauges
             if (family.explain(h).kind, family.explain(h).names) == ("stuck dial", ("xz",))
         ]
     assert found == pytest.approx([-np.log(2e-6)] * 2)
+
+
+def test_errors_of_silent_rows_are_amounts_without_prior(cycles):
+    """Amounts of a very wide prior; also beside another effect, of gauges with different noise."""
+    session = two_gauges(cycles, {"dial": 2e-6, "other": 0.1e-3}, ("yx", "zx"))
+    model, count = linear_model(session), len(session.readings)
+    about = model.at_reference(keep_jacobian=False)
+    silent = np.flatnonzero([r.setup in ("xz", "zx") for r in session.readings])
+    silent = np.append(silent[2:5], silent[-2:])
+    deviation = model.entries(session.values[None])[0] - about.expected
+    outlier = model.entries(np.eye(count)[:1])
+    wide = AmountPrior(np.array([10.0]), np.zeros(silent.size, bool))
+    for groups in ([], [outlier]):
+        priors = [None] * len(groups)
+        found, remaining = score_silent(
+            model, about.likelihood, deviation, silent, groups, priors=priors
+        )
+        errors = model.entries(np.eye(count)[silent])
+        expected = about.likelihood.score_set(deviation, [*groups, errors], priors=[*priors, wide])
+        volume = silent.size * (np.log(10.0) + 0.5 * np.log(2.0 * np.pi))
+        assert found.log_likelihood == pytest.approx(expected.log_likelihood + volume, abs=1e-4)
+        assert found.amounts == pytest.approx(expected.amounts, abs=1e-9)
+        amounts = expected.amounts @ np.concatenate([*groups, errors])
+        assert remaining == pytest.approx(deviation - amounts, abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["outlier", "displaced gauge"])

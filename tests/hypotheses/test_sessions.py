@@ -378,6 +378,24 @@ def test_a_gauge_without_readings_is_not_that_of_the_readings(days):
     assert LinearModel(session).sigma == LinearModel(days[0]).sigma
 
 
+def test_a_dial_that_is_stuck_for_many_readings_is_one_finding(raw_cycles):
+    """The first reading of the run counts, and all others have no information."""
+    name = next(iter(raw_cycles.setups))
+    own = [r for r in raw_cycles.readings if r.setup == name and r.cycle == 1]
+    rng = np.random.default_rng(0)
+    readings = [
+        replace(r, cycle=c + 1, value=r.value + 1e-5 * float(rng.normal()))
+        for c in range(60 // len(own))
+        for r in own
+    ]
+    values = np.array([r.value for r in readings])
+    values[10:50] = values[10]
+    found = find_anomalies(raw_cycles.select(readings).with_values(values)).found
+    assert [(a.explanation.kind, a.explanation.rows) for a in found] == [
+        ("stuck dial", tuple(range(10, 50)))
+    ]
+
+
 @pytest.mark.slow
 def test_memory_is_linear_in_the_readings(raw_cycles):
     """All families consider all readings of a setup. The first search fills caches."""

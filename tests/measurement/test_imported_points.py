@@ -117,6 +117,17 @@ def test_points_and_readings_of_a_dial_in_one_table(tmp_path):
     assert load_session(folder).values == pytest.approx(shown.values, abs=1e-10)
 
 
+def test_a_reading_beside_a_point_is_refused(tmp_path):
+    """In a row of a dial, and in a row of points."""
+    folder, *_ = make(tmp_path, DIAL)
+    heading = ["setup", "posture", "reading_mm", "x_mm", "y_mm", "z_mm"]
+    for setup, column in (("yx", "x_mm"), ("track", "reading_mm")):
+        file = table(tmp_path / "t.csv", heading, [[setup, "p1", "0.12", "1.5", "2.5", "3.5"]])
+        with pytest.raises(SessionError, match=f"{column} is .* expected an empty cell") as refused:
+            import_readings(file, folder)
+        assert refused.value.where.endswith("t.csv:2")
+
+
 def test_a_part_of_the_points_and_a_changed_one(session, tmp_path):
     folder, points = session
     rows = [[f"p{i}", *numbers(p)] for i, p in enumerate(points)]

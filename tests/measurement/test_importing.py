@@ -158,6 +158,10 @@ FORMS = [
     text("named-columns", "A;B;C\nxy;zero;0,00\nxy;x_max;-0,43\nyx;zero;1,5\n",
          columns={"setup": "A", "posture": "b", "reading": "#3"}, unit="mm"),
     text("fill", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\nyx;zero;1,5\n", fill=True),
+    text("fill-below-setups", "setup;posture;Wert mm\nxy;;\n;zero;0,00\n;x_max;-0,43\nyx;;\n"
+         ";zero;1,5\n", fill=True),
+    text("fill-below-postures", "posture;setup;Wert mm\nzero;;\n;xy;0,00\nx_max;;\n;xy;-0,43\n"
+         "zero;;\n;yx;1,5\n", fill=True),
     text("not-filled", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\n",
          "{}:3: has a reading but no setup; --fill copies the setup from the row above"),
     text("total", "setup;posture;Wert mm\nxy;zero;0,00\n;Summe:;-0,43\n",
@@ -576,6 +580,7 @@ xy,x_max,1,,nn
     [
         ("temperature_C", ("21.5", "", "22"), [21.5, None, 22.0]),
         ("Temperatur [°C]", ("21,5", "−1", "22 °C"), [21.5, -1.0, 22.0]),
+        ("Temperatur [°C]", ("21,5", "-", "–"), [21.5, None, None]),
         ("temperature", ("70 °F", "21", "68 deg F"), [21.111, 21.0, 20.0]),
         ("Temperature (F)", ("70", "68", "21 °C"), [21.111, 20.0, 21.0]),
         ("temp", ("20", "70", ""), "the temperature '70' may be in °C or °F"),
@@ -592,6 +597,25 @@ def test_temperatures_of_a_table(heading, cells, expected, session):
         return
     loaded = [r.conditions and r.conditions.temperature for r in load_session(session).readings]
     assert loaded == expected
+
+
+def test_merged_cells_of_conditions_apply_to_all_their_rows(session):
+    conditions = ["approach", "temperature_C", "time"], ["pp", 21.5, "2025-03-14T09:26:00"]
+    head, first, second, third = CELLS
+    rows = [[*head, *conditions[0]], [*first, *conditions[1]], second, third]
+
+    def merge_conditions(made):
+        for column in "DEF":
+            made.worksheets[0].merge_cells(f"{column}2:{column}3")
+
+    found = read(session, book("merged", rows, edit=merge_conditions))
+    assert not isinstance(found, str), found
+    *merged, other = [r.conditions for r in load_session(session).readings]
+    assert other is None
+    for read_back in merged:
+        assert read_back.approach == "pp"
+        assert read_back.temperature == 21.5
+        assert read_back.time == datetime.datetime.fromisoformat(conditions[1][2])
 
 
 def test_times_of_a_table(session):

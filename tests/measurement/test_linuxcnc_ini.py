@@ -69,6 +69,16 @@ def test_joints_are_read(folder, orthoglide):
     )
 
 
+def test_limits_that_limit_nothing_are_infinite(folder, orthoglide):
+    """LinuxCNC's defaults are -1e99 and 1e99."""
+    limits = "[JOINT_0]\nMIN_LIMIT = -1e99\nMAX_LIMIT = 1e99\n"
+    text = INI.replace("[JOINT_0]\n", limits).replace("[JOINT_1]\n", "[JOINT_1]\nMIN_LIMIT = 5\n")
+    (folder / "machine.ini").write_text(text)
+    unlimited = (-np.inf, np.inf)
+    found = read_controller_joints(folder / "machine.ini", orthoglide).limits
+    assert found == (unlimited, (5 * MM, np.inf), unlimited)
+
+
 def test_lines_of_an_export_state_no_direction_of_latching(folder, orthoglide):
     """Which is then assumed and noted, instead of read as positive."""
     lines = [v for v in INI.splitlines() if not v.startswith("HOME_LATCH")]
@@ -97,11 +107,14 @@ def test_backlash_as_written_is_the_same(size):
     ("old", "new", "where"),
     [
         ("LINEAR_UNITS = mm", "LINEAR_UNITS = inch", "[TRAJ]"),
+        ("BACKLASH = 0.031", "UNITS = INCH", "[JOINT_0]"),
         ("[JOINT_2]", "[JOINT_3]", "[JOINT_2]"),
         ("HOME_OFFSET = 340", "HOME_OFFSET = 340,0", "[JOINT_1]"),
         ("BACKLASH = 0.031", "BACKLASH = -0.031", "[JOINT_0]"),
         ("COMP_FILE_TYPE = 1", "COMP_FILE_TYPE = 0", "[JOINT_2]"),
         ("BACKLASH = 0.2", "MIN_LIMIT = 70\nMAX_LIMIT = -150", "[JOINT_2]"),
+        ("BACKLASH = 0.2", "MIN_LIMIT = 1e99\nMAX_LIMIT = 1e99", "[JOINT_2]"),
+        ("BACKLASH = 0.2", "BACKLASH = 1e99", "[JOINT_2]"),
     ],
 )
 def test_wrong_files_are_refused(folder, orthoglide, old, new, where):
@@ -110,6 +123,16 @@ def test_wrong_files_are_refused(folder, orthoglide, old, new, where):
     with pytest.raises(ParameterError) as caught:
         read_controller_joints(folder / "machine.ini", orthoglide)
     assert caught.value.where == f"{folder / 'machine.ini'}: {where}"
+
+
+def test_included_files_are_refused(folder, orthoglide):
+    """Their HOME_OFFSET would be read as 0."""
+    text = INI.replace("HOME_OFFSET = 340", "#INCLUDE y.inc")
+    (folder / "machine.ini").write_text(text)
+    with pytest.raises(ParameterError) as caught:
+        read_controller_joints(folder / "machine.ini", orthoglide)
+    line = text.splitlines().index("#INCLUDE y.inc") + 1
+    assert caught.value.where == f"{folder / 'machine.ini'}:{line}"
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +184,21 @@ def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
     twice = export(folder, one, "twice", "--ini", plain, "--latched", "+,+,+")
     assert twice.returncode == 2
     assert "--latched" in twice.stderr
+
+
+def test_a_fragment_of_changes_states_no_home_offset(folder, one, plain):
+    """As exported without HOME_OFFSET; then the option states it."""
+    lines = [v for v in plain.read_text().splitlines() if not v.startswith("HOME_")]
+    (folder / "changes.ini").write_text("\n".join(lines))
+    home = ["--home-offset", "352.5,340,-3.25"]
+    for name, words in (("no-file", []), ("stated", home)):
+        assert export(folder, one, name, *words).returncode == 0
+        done = export(folder, one, f"{name}-ini", "--ini", "changes.ini", *words)
+        assert done.returncode == 0, done.stderr
+        texts = [(folder / n / "joints.ini").read_text() for n in (name, f"{name}-ini")]
+        entered = [re.findall(r"^(?:# )?HOME_OFFSET = .*", text, re.M) for text in texts]
+        assert entered[0] == entered[1]
+        assert len(entered[0]) == 3
 
 
 def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):

@@ -15,7 +15,7 @@ from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.refit import repeat_fit
-from orthocal.errors import SessionError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
@@ -209,6 +209,31 @@ def test_printed_keys_of_mixed_drives_are_those_of_a_session(tmp_path):
     (tmp_path / "joints.ini").write_text(f"# controller: {{{keys}}}\n{lines}")
     stated = read_controller_joints(tmp_path / "joints.ini", robot).offsets
     assert stated == pytest.approx(offsets, abs=KINEMATICS)
+
+
+@pytest.mark.parametrize(
+    ("units", "joint", "where"),
+    [
+        ("degree", "DEG", None),
+        ("radian", "", "[TRAJ]"),
+        ("gon", "", "[TRAJ]"),
+        ("deg", "rad", "[JOINT_1]"),
+        ("deg", "mm", "[JOINT_1]"),
+    ],
+)
+def test_angles_of_an_ini_file_are_in_degrees(tmp_path, units, joint, where):
+    robot = load_mixed(tmp_path, "{offsets_mm: [0, 0], offsets_deg: [0]}").robot
+    file = tmp_path / "machine.ini"
+    stated = f"UNITS = {joint}\n" if joint else ""
+    turn = f"[JOINT_1]\n{stated}HOME_OFFSET = 90\n"
+    file.write_text(f"[TRAJ]\nANGULAR_UNITS = {units}\n[JOINT_0]\n{turn}[JOINT_2]\n")
+    if where is None:
+        homes = read_controller_joints(file, robot).home_offsets
+        assert homes == pytest.approx([0.0, np.pi / 2, 0.0])
+        return
+    with pytest.raises(ParameterError) as caught:
+        read_controller_joints(file, robot)
+    assert caught.value.where == f"{file}: {where}"
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,12 @@ class NonlinearProgram(Program):
         return replace(data, start=best.theta, start_passive=best.passive)
 
     def _run(self, data: SolverInput, width_factor: float = 1.0) -> Solution:
-        """Run Ipopt once, with a multiple of the width of a robust loss."""
+        """Run Ipopt once, with a multiple of the width of a robust loss.
+
+        Raises:
+            SolverError: If Ipopt does not converge.
+            OrthocalError: If Ipopt lacks what an option requests, such as a linear solver.
+        """
         problem, sigma, prescribed = self.problem, data.sigma, data.prescribed
         lower, upper = self.variable_bounds(prescribed)
         theta = np.clip(
@@ -187,6 +192,12 @@ class NonlinearProgram(Program):
             result = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])
+        if status == "Invalid_Option":
+            stated = ", ".join(f"'{k}': {v!r}" for k, v in self.options.ipopt.items())
+            raise OrthocalError(
+                f"SolverOptions(ipopt=...): Ipopt cannot use these options: {stated}; if one "
+                "names a linear solver, its library is not installed"
+            )
         if status != CONVERGED:
             raise SolverError(
                 f"Ipopt did not converge: {status} after {iterations} iterations; "

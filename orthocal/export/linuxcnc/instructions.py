@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import (
@@ -59,9 +60,8 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
             f"[JOINT_{i}]",
             f"# {comment_safe(home.drive.name)}, counts {home.counting}: "
             f"{home.show(home.change, sign=True)} {home.drive.joint_unit}",
-            _line("HOME_OFFSET", home, home.new, home.change),
-            *([] if stated else _opposite_line(home)),
-            *_limit_lines(home, None if home.new is None else home.new_limits),
+            *_home_lines(home),
+            *([] if stated else _opposite_lines(home)),
             *_compensation_lines(i, home),
         ]
     return "\n".join(lines) + "\n"
@@ -106,15 +106,24 @@ def write_module_lines(approximation: Approximation, homes: Sequence[JointHome])
     return "\n".join(lines) + "\n"
 
 
-def _opposite_line(home: JointHome) -> list[str]:
-    """Comment with HOME_OFFSET for the other sign of HOME_LATCH_VEL, if it differs."""
+def _home_lines(home: JointHome) -> list[str]:
+    """HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of a joint."""
+    return [
+        _line("HOME_OFFSET", home, home.new, home.change),
+        *_limit_lines(home, None if home.new is None else home.new_limits),
+    ]
+
+
+def _opposite_lines(home: JointHome) -> list[str]:
+    """Comments with the lines that differ for the other sign of HOME_LATCH_VEL."""
     if not _depends_on_latching(home):
         return []
-    if home.old is None:
-        value = f"present value {home.show(home.opposite, sign=True)}"
-    else:
-        value = home.show(home.old + home.opposite)
-    return [f"# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET = {value}"]
+    lines, opposite = _home_lines(home), _home_lines(replace(home, change=home.opposite))
+    return [
+        f"# if HOME_LATCH_VEL of this joint is negative: {line.removeprefix('# ')}"
+        for line in opposite
+        if line not in lines
+    ]
 
 
 def _depends_on_latching(home: JointHome) -> bool:

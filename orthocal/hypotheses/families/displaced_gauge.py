@@ -21,7 +21,7 @@ MIN_STUCK = 2
 """Fewest equal consecutive readings of a stuck dial, or of a reading that was written twice."""
 
 MAX_STUCK = 16
-"""Most readings of a run of equal ones that are used."""
+"""Number of lengths of a stuck run that the prior counts; longer runs are possible, too."""
 
 
 def displaced_gauges(rows: Rows) -> Iterator[Family]:
@@ -89,7 +89,7 @@ def _stuck(rows: Rows) -> Family | None:
         Explanation("stuck dial", "setup", tuple(run.tolist()), names=(setup,))
         for run, setup in zip(runs, setups, strict=True)
     ]
-    silent = [run[1 : MAX_STUCK + 1] for run in runs]
+    silent = [run[1:] for run in runs]
     firsts = [int(run[0]) for run in runs]
     steps = np.array([rows.gauge(i).resolution or rows.sigma(i) for i in firsts])
     volume = -np.log(steps) * [len(indices) for indices in silent]

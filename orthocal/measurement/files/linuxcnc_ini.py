@@ -13,7 +13,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.effects.compensation import MAX_COMP_FILE_ENTRIES, Compensation, JointTrim
 from orthocal.errors import ParameterError, SessionError
-from orthocal.io.documents import parse_number, read_text
+from orthocal.io.documents import LARGEST_NUMBER, parse_number, read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
 from orthocal.measurement.files.session_keys import LARGEST_TRIM
@@ -28,16 +28,20 @@ EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{(offsets_[^{}]*)\}$")
 OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
 """Offsets of the drives with one unit in this comment."""
 
-METRIC_UNITS = ("mm", "metric")
-"""Values of LINEAR_UNITS with which lengths are in mm."""
+UNIT_KEYS = {"mm": "LINEAR_UNITS", "deg": "ANGULAR_UNITS"}
+"""Keys of [TRAJ] that state the unit of a drive, by this unit."""
+
+UNIT_WORDS = {"mm": ("mm", "metric"), "deg": ("deg", "degree")}
+"""Values of these keys that mean the unit of the drive, in lower case."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControllerJoints:
     """Joints of a controller, in the order of the drives."""
 
-    home_offsets: tuple[float, ...]
-    """HOME_OFFSET, [m, rad]."""
+    home_offsets: tuple[float, ...] | None
+    """HOME_OFFSET, [m, rad]; None if no joint states it or HOME_LATCH_VEL, as in a fragment that
+    states changes only."""
     limits: tuple[tuple[float, float], ...]
     """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
     latched: tuple[int, ...] | None
@@ -60,28 +64,40 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         SessionError: If a COMP_FILE is wrong.
     """
     sections = _read_sections(path)
-    units = sections.get("TRAJ", {}).get("LINEAR_UNITS", "mm")
-    if units not in METRIC_UNITS:
-        raise ParameterError(f"LINEAR_UNITS is {units}; expected mm", where=f"{path}: [TRAJ]")
+    trajectory = sections.get("TRAJ", {})
     joints = []
     for i, drive in enumerate(robot.drives):
-        where = f"{path}: [JOINT_{i}]"
+        unit, where = drive.joint_unit, f"{path}: [JOINT_{i}]"
+        _require_unit(trajectory, UNIT_KEYS[unit], unit, f"{path}: [TRAJ]")
         keys = sections.get(f"JOINT_{i}")
         if keys is None:
             raise ParameterError(
                 f"the section is missing; it belongs to drive {drive.name}", where=where
             )
+        _require_unit(keys, "UNITS", unit, where)
         home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
         joints.append((home, _read_limits(keys, drive, where), latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
+    known = stated or any(home is not None for home in homes)
     return ControllerJoints(
-        homes,
+        tuple(home or 0.0 for home in homes) if known else None,
         limits,
         tuple(latch or 1 for latch in latched) if stated else None,
         trims,
         None if stated else _read_offsets(path, robot.drives),
     )
+
+
+def _require_unit(keys: Mapping[str, str], key: str, unit: str, where: str) -> None:
+    """Refuse a section that states another unit than that of a drive, mm or deg.
+
+    Raises:
+        ParameterError: If it does; names the key.
+    """
+    stated = keys.get(key)
+    if stated is not None and stated.casefold() not in UNIT_WORDS[unit]:
+        raise ParameterError(f"{key} is {stated}; expected {unit}", where=where)
 
 
 def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | None:
@@ -100,8 +116,10 @@ def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | No
 
 def _read_joint(
     keys: Mapping[str, str], drive: Drive, *, folder: Path, where: str
-) -> tuple[float, int | None, JointTrim]:
+) -> tuple[float | None, int | None, JointTrim]:
     """Home offset, [m, rad], sign of HOME_LATCH_VEL and compensation of a joint.
+
+    Home offset and sign are None if not stated.
 
     Args:
         keys: Keys of its section.
@@ -133,20 +151,26 @@ def _read_joint(
     latch = None
     if "HOME_LATCH_VEL" in keys:
         latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
-    return numbers["HOME_OFFSET"] * factor, latch, JointTrim(numbers["BACKLASH"] * factor, table)
+    home = numbers["HOME_OFFSET"] * factor if "HOME_OFFSET" in keys else None
+    return home, latch, JointTrim(numbers["BACKLASH"] * factor, table)
 
 
 def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[float, float]:
     """MIN_LIMIT and MAX_LIMIT of a joint, [m, rad]; infinite if not stated.
 
+    Numbers beyond LARGEST_NUMBER are infinite, too: for LinuxCNC, ±1e99 means no limit.
+
     Raises:
         ParameterError: If one is no number, or the lowest is above the highest.
     """
     factor = drive.joint_size
-    low, high = (
-        parse_number(keys[key], where=where, name=key, error=ParameterError) if key in keys else end
-        for key, end in (("MIN_LIMIT", -math.inf), ("MAX_LIMIT", math.inf))
+    stated = (
+        parse_number(
+            keys.get(key, default), where=where, name=key, error=ParameterError, largest=math.inf
+        )
+        for key, default in (("MIN_LIMIT", "-1e99"), ("MAX_LIMIT", "1e99"))
     )
+    low, high = (v if abs(v) <= LARGEST_NUMBER else math.copysign(math.inf, v) for v in stated)
     if low >= high:
         raise ParameterError(
             f"MIN_LIMIT is {low:g} {drive.joint_unit}, not below MAX_LIMIT, "
@@ -157,10 +181,20 @@ def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[flo
 
 
 def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
-    """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC."""
+    """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC.
+
+    Raises:
+        ParameterError: If the file includes another one; names the line.
+    """
     sections = dict[str, dict[str, str]]()
     current = dict[str, str]()
-    for line in read_text(path, error=ParameterError).splitlines():
+    text = read_text(path, error=ParameterError)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.lstrip().startswith("#INCLUDE"):
+            raise ParameterError(
+                "#INCLUDE is not supported; replace it by the lines of the included file",
+                where=f"{path}:{number}",
+            )
         bare = re.sub(r"(^|\s)[#;].*", "", line).strip()  # without its comment
         if bare.startswith("[") and bare.endswith("]"):
             current = sections.setdefault(bare[1:-1].strip(), {})

@@ -310,11 +310,12 @@ def _read_entries(
         unheaded = sum(not c.is_blank for c in row.cells[len(table.header) :])
         if unheaded:
             skipped.append((row.line, f"{unheaded} cells without a heading"))
-        if not filled_cells and not all(names[role] for role in name_roles):
+        complete = all(names[role] for role in name_roles)
+        if fill:  # also from a row that states a name only
+            names = above = {role: name or above[role] for role, name in names.items()}
+        if not filled_cells and not complete:
             skipped.append((row.line, NO_READING))
             continue
-        if fill:
-            names = above = {role: name or above[role] for role, name in names.items()}
         _require_names(table, row, names, name_roles)
         cells = _read_optional_cells(table, row, columns) | names
         for i, heading in _length_columns(columns, filled_cells).items():
@@ -338,7 +339,7 @@ def _without_units_row(
     table: Table, columns: Columns, skipped: SkippedRows
 ) -> tuple[Iterable[Row], dict[int, UnitName]]:
     """Rows below the headings without a row of units, and these units by column."""
-    rows = table.fill_merged(columns.keys)
+    rows = table.fill_merged(columns.single.values())
     for first in rows:
         units = _read_units_row(first, columns)
         if not units:
@@ -351,6 +352,8 @@ def _without_units_row(
 def _length_columns(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:
     """Columns of lengths that belong to a row: those of its point, or of its readings.
 
+    A reading beside a point remains, so that the row is refused.
+
     Args:
         columns: Roles of the columns.
         filled: Indices of the columns with a number in this row.
@@ -359,7 +362,7 @@ def _length_columns(columns: Columns, filled: Sequence[int]) -> dict[int, Headin
     if not filled:
         is_point = not any(h.role == "reading" for h in columns.readings.values())
     excluded: tuple[Role, ...] = ("reading",) if is_point else POINT
-    return {i: h for i, h in columns.readings.items() if h.role not in excluded}
+    return {i: h for i, h in columns.readings.items() if h.role not in excluded or i in filled}
 
 
 def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, str]:
@@ -378,12 +381,14 @@ def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, 
 
 
 def _read_temperature(table: Table, row: Row, column: int) -> str:
-    """Temperature of a row in °C; text that is not a number is returned unchanged.
+    """Temperature of a row in °C; empty for a dash.
+
+    Other text that is not a number is returned unchanged.
 
     Raises:
         SessionError: If the temperature may be in °C or °F.
     """
-    text = row.cell(column).text.strip()
+    text = _name(row.cell(column))
     number, unit = split_degrees(text)
     degrees = unit or split_degrees(table.header[column])[1]
     value = parse_numeral(number.strip(), "comma" if "," in number else "point")

@@ -270,6 +270,17 @@ def test_an_option_that_ipopt_refuses_is_named(experiment_2, options, named, cap
     capfd.readouterr()
 
 
+def test_a_linear_solver_that_is_not_installed_is_named(experiment_2, capfd):
+    """Ipopt accepts the name, and loads the library when it solves."""
+    options = SolverOptions(ipopt={"hsllib": "absent.so", "linear_solver": "ma57"})
+    program = NonlinearProgram(build_problem(experiment_2, model="offsets"), options=options)
+    with pytest.raises(OrthocalError, match="'linear_solver': 'ma57'") as caught:
+        program.solve(sigma=1e-5)
+    assert not isinstance(caught.value, SolverError)
+    assert "iterations" not in str(caught.value)
+    capfd.readouterr()
+
+
 def test_options_reach_ipopt(experiment_2):
     problem = build_problem(experiment_2, model="offsets")
     plain = NonlinearProgram(problem).solve(sigma=1e-5)
