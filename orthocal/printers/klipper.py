@@ -16,7 +16,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.io.documents import parse_number
+from orthocal.io.documents import LARGEST_NUMBER, parse_number
 from orthocal.printers.klipper_print import Distances, has_analysis, read_analysis, saved_distances
 from orthocal.printers.log import (
     NUMBER,
@@ -155,6 +155,27 @@ def _probed(match: re.Match[str], source: LogText) -> list[float]:
     return numbers(match.groups(), where=line, name="probe")
 
 
+_DAMAGED = (
+    ValueError,
+    SyntaxError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    MemoryError,
+    OverflowError,
+)
+"""Errors that a damaged calculation can raise."""
+
+
+def _require_plausible(*values: object) -> None:
+    """Raise ValueError if a number in nested lists is not finite, or beyond LARGEST_NUMBER."""
+    for value in values:
+        if isinstance(value, list | tuple):
+            _require_plausible(*value)
+        elif not abs(float(str(value))) <= LARGEST_NUMBER:
+            raise ValueError
+
+
 def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
     """Settings and triggers of a calculation in klippy.log; `line` is its file and line."""
     try:
@@ -171,7 +192,8 @@ def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
             line,
         )
         steps = np.array([value[f"stepdist_{k}"] for k in TOWERS]) * MM
-    except (ValueError, SyntaxError, TypeError, KeyError, AttributeError, MemoryError) as e:
+        _require_plausible(pairs, distances, [*value.values()])
+    except _DAMAGED as e:
         raise SessionError(
             f"the calculation of delta_calibrate is damaged ({type(e).__name__}); expected lists "
             "of heights, distances and parameters as Klipper writes them",
@@ -358,7 +380,7 @@ def _sections(text: str) -> dict[str, dict[str, str]]:
     current: dict[str, str] = {}
     for line in text.splitlines():
         bare = re.sub(r"(^|\s)[#;].*", "", re.sub(r"^#\*# ?", "", line)).strip()
-        if head := re.fullmatch(r"\[([\w ]+)\]", bare):
+        if head := re.fullmatch(r"\[([^\[\]]+)\]", bare):
             current = sections.setdefault(head[1].strip(), {})
         elif pair := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", bare):
             current[pair[1]] = pair[2]

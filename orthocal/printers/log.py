@@ -305,8 +305,13 @@ def last_words(text: str, pattern: str) -> dict[str, str]:
 
 def command_words(text: str, pattern: str) -> Iterator[tuple[int, dict[str, str]]]:
     """Position of each line with a G-code command, and its letters and values."""
-    for match in re.finditer(rf"^[^;\n]*?\b{pattern}\b([^;\n]*)", text, re.MULTILINE):
-        yield match.start(1), dict(re.findall(rf"\b([A-Z]) ?({NUMBER}(?::{NUMBER})*)", match[1]))
+    for match in re.finditer(rf"^[^;\n]*?\b{pattern}(?![\d.])([^;\n]*)", text, re.MULTILINE):
+        yield match.start(1), read_words(match[1])
+
+
+def read_words(text: str) -> dict[str, str]:
+    """Letters and values of a G-code line, also if no blanks separate them."""
+    return dict(re.findall(rf"(?<![A-Za-z])([A-Z]) ?({NUMBER}(?::{NUMBER})*)", text))
 
 
 def require_one_value(source: LogText, command: str, *, since: int = 0, until: int) -> None:

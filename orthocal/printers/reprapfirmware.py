@@ -20,6 +20,7 @@ from orthocal.printers.log import (
     last_words,
     numbers,
     probed_log,
+    read_words,
     unstated_trigger,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
@@ -167,7 +168,7 @@ def _points(source: LogText, report: int) -> Array:
     places: dict[float, tuple[float, float]] = {}
     matches = list(_POINT.finditer(source.text))
     for match in [m for m in matches if m.start() < report] or matches:
-        words = dict(re.findall(rf"\b([A-Z])({NUMBER})", match["words"]))
+        words = read_words(match["words"])
         if {"P", "X", "Y"} <= words.keys():
             line = source.place(match.start())
             number, x, y = numbers([words[k] for k in "PXY"], where=line, name="G30")

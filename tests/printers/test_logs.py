@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -111,23 +112,32 @@ def test_saved_heights_state_that_of_the_probe(probed):
         assert np.abs(log.heights).max() < 1e-12
 
 
-def test_a_calculation_in_klippy_log(probed):
-    """It holds its own parameters, and heights measured by hand count as they are."""
+POINTS = np.array([[0, 0, 1.5], [50, 0, 1.5], [0, 50, 1.5], [-20, -50, 0.1]])
+
+
+def calculation(**changed):
+    """Calculation of delta_calibrate in klippy.log for POINTS in reverse order."""
     s = odd()
     parameters = {"radius": s.radius}
     for i, k in enumerate("abc"):
         parameters |= {f"angle_{k}": s.angles[i], f"arm_{k}": s.rods[i], f"stepdist_{k}": 0.01}
         parameters |= {f"endstop_{k}": s.endstops[i]}
-    plain = {k: float(v) for k, v in parameters.items()}
-    points = np.array([[0, 0, 1.5], [50, 0, 1.5], [0, 50, 1.5], [-20, -50, 0.1]])
-    steps = s.travel(points) / 0.01
-    pairs = [
-        (float(p[2]), tuple(map(float, t))) for p, t in zip(points[::-1], steps[::-1], strict=True)
-    ]
-    log = probed(
-        f"Calculating delta_calibrate with:\n{pairs}\n[(74.0, {pairs[0][1]}, {pairs[1][1]})]\n"
-        f"Initial delta_calibrate parameters: {plain}\nCoordinate descent initial error: 1\n"
+    stated = ", ".join(
+        f"'{k}': {v}" for k, v in ({k: float(v) for k, v in parameters.items()} | changed).items()
     )
+    steps = s.travel(POINTS) / 0.01
+    pairs = [
+        (float(p[2]), tuple(map(float, t))) for p, t in zip(POINTS[::-1], steps[::-1], strict=True)
+    ]
+    return (
+        f"Calculating delta_calibrate with:\n{pairs}\n[(74.0, {pairs[0][1]}, {pairs[1][1]})]\n"
+        f"Initial delta_calibrate parameters: {{{stated}}}\nCoordinate descent initial error: 1\n"
+    )
+
+
+def test_a_calculation_in_klippy_log(probed):
+    """It holds its own parameters, and heights measured by hand count as they are."""
+    log, points = probed(calculation()), POINTS
     assert np.abs(log.settings.forward(log.carriages) / MM - points[::-1]).max() < 1e-6
     assert log.heights == pytest.approx(np.array([-1.4, 0, 0, 0]) * MM)
     (distance,) = log.distances
@@ -378,3 +388,28 @@ def test_what_two_readers_of_a_setting_disagree_about_is_refused(probed):
     )
     with pytest.raises(SessionError, match=r"0:-0\.2"):
         probed(text, radius=0.08)
+
+
+def test_words_of_a_command_need_no_blanks(probed):
+    """Marlin and RepRapFirmware read `M666 X-0.5Y0.8Z-0.3`."""
+    for firmware in ("marlin", "reprapfirmware"):
+        text = write_log(firmware, odd(firmware), rings(), np.zeros(len(rings())))
+        expected = probed(text).settings
+        close = re.sub(r"(?m)^(.*\bM66[56]\b) ?(.*)$", lambda m: m[1] + m[2].replace(" ", ""), text)
+        assert close != text
+        assert probed(close).settings == expected
+
+
+def test_sections_with_hyphens_are_sections(probed):
+    """Their keys are not those of the section before."""
+    text = write_log("klipper", odd(), rings(), np.zeros(len(rings())))
+    at = text.index("[probe]")
+    other = "[extruder_stepper right-hand]\nrotation_distance: 22.6\nmicrosteps: 32\n\n"
+    assert probed(text[:at] + other + text[at:]).settings == probed(text).settings
+
+
+@pytest.mark.parametrize("value", ["1e200", "1e999", "1" + 400 * "0"])
+@pytest.mark.parametrize("name", ["arm_a", "stepdist_a"])
+def test_numbers_of_a_calculation_are_finite(probed, name, value):
+    with pytest.raises(SessionError, match=r"is damaged|expected"):
+        probed(calculation(**{name: value}))
