@@ -233,11 +233,14 @@ class _Correction:
             )
         if summary.outside is not None:
             notes.append(
-                f"{self.file}:{summary.outside}: leaves the workspace {self.region}, over which "
-                "the correction was determined. Beyond it the correction is less certain."
+                f"{self.file}:{summary.outside}: leaves the workspace {self.region} around the "
+                "mechanical zero, over which the correction was determined. Beyond it the "
+                "correction is less certain."
             )
         if not self.controller.work_offsets:
             notes.append("The program's coordinates are read as machine coordinates.")
+        elif "G54" not in self.controller.work_offsets:
+            notes.append("Coordinates before the first stated work zero are machine coordinates.")
         if self.region:
             notes.append("A work zero that was touched off without correction remains valid.")
         if summary.unit_assumed:
@@ -307,7 +310,8 @@ def _put_program(spool: IO[bytes], out: Path | None) -> None:
     if out is not None:
         write_file(out, iter(lambda: spool.read(BLOCK_SIZE), b""))
         return
-    with io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="") as text:
+    # a byte in another encoding becomes one question mark: lines keep their length
+    with io.TextIOWrapper(spool, encoding="utf-8", errors="surrogateescape", newline="") as text:
         while part := text.read(BLOCK_SIZE):
             put_part(part)
     sys.stdout.flush()

@@ -66,7 +66,7 @@ P_WORDS = frozenset({50.0, 51.0, 52.0, 53.0, 62.0, 63.0, 64.0, 65.0})
 M_WORDS = STOPS | P_WORDS | frozenset(float(m) for m in (3, 4, 5, 6, 7, 8, 9, 48, 49))
 """Accepted M-words."""
 
-TOOL_CHANGE = 6.0
+TOOL_CHANGE, PALLET_CHANGE = 6.0, 60.0
 
 _LINES_AND_ARCS = "write the motion as lines and arcs (G0 to G3)"
 _STATE_ZERO = "set it before the program, and state the zero with --work-offset-mm"
@@ -286,6 +286,8 @@ class Interpreter:
             if word.letter == "M":
                 ends |= word.value in ENDS
                 change |= word.value == TOOL_CHANGE
+                if word.value in (TOOL_CHANGE, PALLET_CHANGE):
+                    self._forget_position()
             elif word.value != self.modes.motion:
                 dwell |= word.value == 4.0
                 self._set_mode(word, where)
@@ -436,6 +438,12 @@ class Interpreter:
     def _motion(self) -> str:
         """Name of the active motion, for messages."""
         return "none" if self.modes.motion is None else f"G{self.modes.motion}"
+
+    def _forget_position(self) -> None:
+        """Treat the next motion as the first one: a tool change may have moved the machine."""
+        for k in self.axes:
+            self.position[k] = None
+        self._moved = False
 
     def _move(self, line: Line, words: Mapping[str, float], where: str) -> Step:
         """Effect of a line with coordinates.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -286,8 +288,24 @@ def test_command_line(command, tmp_path):
     assert command(None, typed=PROGRAM)[0] == 0
 
 
+def test_a_work_zero_that_is_not_the_first_is_noted(command):
+    text = PROGRAM + "G55 G0 X1 Y2 Z3\r\n"
+    code, _, err = command(text, "--work-offset-mm", "G55=10,10,0")
+    assert code == 0
+    assert "Coordinates before the first stated work zero are machine coordinates." in err
+
+
+def test_lines_on_standard_output_are_as_long_as_in_a_file(calibration, tmp_path):
+    """A comment in Latin-1 does not grow beyond the longest line of LinuxCNC."""
+    write_calibration(calibration, tmp_path / "calibration.json")
+    (tmp_path / "p.ngc").write_bytes(PROGRAM.encode("latin-1"))
+    command = [sys.executable, "-m", "orthocal", "correct", ".", "p.ngc"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
+    assert done.stdout.endswith(b"F100 (?)\r\n")
+
+
 def test_several_tools_without_a_tip_are_reported(command):
-    code, _, err = command("T1 M6\n" + PROGRAM + "T2 M6\nG1 X6\n")
+    code, _, err = command("T1 M6\n" + PROGRAM + "T2 M6\nG0 X1 Y2 Z3\nG1 X6\n")
     assert code == 0
     assert "Several tools (T1, T2) and no --tool" in err
     assert "Several tools" not in command("T1 M6\n" + PROGRAM)[2]

@@ -309,12 +309,12 @@ def test_refused_words_are_named_with_their_line(line):
 CUT = ["G0 X0 Y0 Z0", "G1 X1 F100"]
 
 ONE_TOOL = {
-    "loaded once": ["T1 M6", *CUT, "M6", "T1 M6", "X2"],
-    "preselected": ["T1 M6", *CUT, "T2", "X2", "T1", "M6", "X3"],
-    "selected before M6": ["T1", *CUT, "T1 M6", "X2"],
+    "loaded once": ["T1 M6", *CUT, "M6", "T1 M6", *CUT],
+    "preselected": ["T1 M6", *CUT, "T2", "X2", "T1", "M6", *CUT],
+    "selected before M6": ["T1", *CUT, "T1 M6", *CUT],
     "changed before it moves": ["T2", "T3 M6", "T1 M6", *CUT],
     "retracted before": ["G0 X0 Y0 Z9", "T1 M6", *CUT],
-    "unloaded at the end": ["T1 M6", *CUT, "T0 M6", "G0 Z9", "T1 M6", "G1 X2"],
+    "unloaded at the end": ["T1 M6", *CUT, "T0 M6", "G0 Z9", "T1 M6", *CUT],
     "without a number": ["M6", *CUT],
 }
 
@@ -341,7 +341,7 @@ def test_second_tool_is_refused_with_a_tip(text, number, message):
         corrected(["G21", *text, "G1 X9", "M2"], one_tool=True)
     assert str(refused.value).startswith(f"p.ngc:{number + 1}: {message}")
     assert "expected one tool: split the program by tools" in str(refused.value)
-    corrected(["G21", *text, "G1 X9 F100", "M2"])  # without a tip
+    corrected(["G21", *text, *CUT, "M2"])  # without a tip
 
 
 def test_position_and_first_motion_must_be_known():
@@ -352,6 +352,19 @@ def test_position_and_first_motion_must_be_known():
     ):
         with pytest.raises(GcodeError, match=message):
             corrected(text)
+
+
+@pytest.mark.parametrize("change", ["T2 M6", "M60"])
+def test_a_tool_change_may_have_moved_the_machine(change):
+    """A retracted axis does not return to its position before the change."""
+    text = ["G21 G90 G0 X1 Y2 Z3", "G1 X4 F100", change, "G0 X8 Y9", "Z3", "G1 X5"]
+    lines, _ = corrected(text)
+    assert lines[2:4] == text[2:4]
+    for line, point in ((lines[4], (8.0, 9.0, 3.0)), (lines[-1], (5.0, 9.0, 3.0))):
+        found = [float(re.search(rf"{k}(-?[\d.]+)", line)[1]) for k in "XYZ"]
+        assert found == pytest.approx(bend([point])[0], abs=1e-3)
+    with pytest.raises(GcodeError, match="found G1 as the first motion"):
+        corrected([*text[:3], "G1 X8 Y9 Z3"])
 
 
 def test_a_rapid_motion_to_a_safe_height_may_come_first():
