@@ -76,7 +76,9 @@ def again(
     new = _plan_again(result, session, amounts)
     joints = None
     if ini is None:
-        new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
+        new = replace(
+            new, compensation=compensation_to_enter(result) or result.session.compensation
+        )
     else:
         joints = read_controller_joints(ini, result.robot)
         new = replace(new, compensation=joints.compensation)
