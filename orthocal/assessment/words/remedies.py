@@ -12,7 +12,7 @@ from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.session.session import Reading, Session, split_label
 from orthocal.text import quote_path, spans
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import DRIVE_UNITS, MM, format_fixed, trim_zeros
 
 
 def advise(session: Session, e: Explanation) -> str:
@@ -20,7 +20,8 @@ def advise(session: Session, e: Explanation) -> str:
     if e.scope == "reading" and (e.factor is not None or e.kind == "misread dial"):
         stated = session.readings[e.rows[0]].value / MM
         corrected = stated - (e.amount or 0.0) / MM if e.factor is None else stated * e.factor
-        return f"If so, write {corrected:+.6g} instead of {stated:+.6g}."
+        new, old = (trim_zeros(format_fixed(v, 6, sign=True)) for v in (corrected, stated))
+        return f"If so, write {new} instead of {old}."
     if e.kind == "reversed sign" and e.setups:
         reverse_direction = ""
         if all("direction" in session.setups[name].sensor.to_keys() for name in e.setups):
