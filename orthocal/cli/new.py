@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -163,6 +163,14 @@ class FirstPlanOptions:
     temperature: TemperatureRange = None
     tolerance: Tolerances = None
 
+    def changed(self) -> dict[str, object]:
+        """Values that differ from their defaults, by option."""
+        return {
+            f"--{f.name.strip('_').replace('_', '-')}": value
+            for f in fields(self)
+            if (value := getattr(self, f.name)) != f.default
+        }
+
     def read_effects(self) -> dict[str, dict[str, float]]:
         """Effects of the machine, mapped to keys that replace their defaults."""
         effects: dict[str, dict[str, float]] = {
@@ -196,7 +204,7 @@ def new(
     """
     if again:
         stated: dict[str, object] = {o: text for o, text in dimensions.by_key().values()}
-        stated |= {"--kind": dimensions.kind, "--workspace-mm": options.workspace_mm}
+        stated |= {"--kind": dimensions.kind} | options.changed()
         _require_none(stated | {"--backlash": controller.backlash, "--ini": controller.ini})
         _make_again(folder)
         return
