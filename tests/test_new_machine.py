@@ -396,6 +396,18 @@ def test_a_plan_out_of_reach_is_old(copied):
     assert "--force" not in err
 
 
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [("plan.json", "5"), ("plan.json", "null"), ("plan.json", "{"), ("session.yaml", "robot: [")],
+)
+def test_a_damaged_plan_is_not_called_out_of_reach(copied, file, content):
+    (copied / "first" / file).write_text(content)
+    code, _, err = orthocal("new", copied, "--again")
+    assert code == 2
+    assert err.startswith(f"orthocal: {copied}/first/{file}:")
+    assert "does not reach" not in err
+
+
 def test_existing_files_are_not_overwritten(copied):
     before = (copied / "mill.urdf").read_text()
     given = ["new", copied, *options(leg_mm="260"), "--paper"]
