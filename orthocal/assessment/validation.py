@@ -61,6 +61,7 @@ from orthocal.measurement.joining import (
     Given,
     gather_sessions,
     join_sessions,
+    list_members,
     on_one_printer,
     require_same_tolerances,
 )
@@ -379,7 +380,7 @@ def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
         SessionError: If a session belongs to the calibration; it names the session.
     """
     record = calibration.session
-    for session in sessions:
+    for session in (member for one in sessions for member in list_members(one)):
         if any(session.was_read_from(part.sha256) for part in (record, *record.parts)):
             raise SessionError(
                 "belongs to the calibration itself; expected a session measured afterwards",
