@@ -451,7 +451,7 @@ class Recording:
             OutputError: If the files cannot be written.
         """
         dropped = self.dropped[line]
-        existing = [r.key for r in self.rows[: len(dropped)]]
+        existing = [self.rows[0].key] * len(dropped)  # fewer rows may remain than a point has
         self._apply(Change(done="added", rows=[*existing, *dropped]))
         return len(self.rows) - len(dropped)
 

@@ -614,6 +614,18 @@ def test_a_point_is_deleted_and_emptied_with_all_its_coordinates(tracked):
         assert [r.setup for r in recording.rows if r.is_read] == ["yx"]
 
 
+def test_a_deleted_point_comes_back_if_fewer_rows_remain(tracked):
+    """A point has three rows; those that remain are the two of the dial."""
+    folder, *_ = tracked
+    with open_recording(folder) as recording:
+        while len(recording.rows) > 2:
+            line = recording.rows[0].line
+            recording.drop(0)
+        index = recording.restore(line)
+        assert (index, recording.point(index)) == (2, [2, 3, 4])
+    assert len(load_plan(folder).readings) == 5
+
+
 def test_a_killed_recording_of_points_is_restored(tracked, monkeypatch):
     """The journal has a point before the CSV does: it comes back with all three coordinates."""
     folder, points, _ = tracked
