@@ -339,11 +339,14 @@ class Recording:
             conditions: Conditions of the reading; those that are None do not change.
 
         Raises:
-            SessionError: If the reading is beyond the range of the gauge, if the row cannot have
-                the conditions, or if the plan states another approach.
+            SessionError: If the reading is NaN or beyond the range of the gauge, if the row cannot
+                have the conditions, or if the plan states another approach.
             OutputError: If the files cannot be written.
         """
         rows = [self.rows[i] for i in self.point(index)]
+        if np.isnan(value).any():
+            where = rows[0].label_with_cycle
+            raise SessionError("reading_mm is nan; expected a number", where=where)
         setups = [self.session.setups[row.setup] for row in rows]
         conditions = conditions or Conditions()
         readings_mm = []

@@ -244,6 +244,13 @@ def test_what_the_gauge_cannot_show_is_not_taken(plan, value):
     load_plan(plan)
 
 
+def test_a_reading_is_a_number(plan):
+    with open_recording(plan) as r:
+        with pytest.raises(SessionError, match="yx zero: reading_mm is nan; expected a number"):
+            r.read(0, np.nan)
+        assert r.missing[0] == 0
+
+
 def test_the_only_row_stays(plan):
     (plan / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,\n")
     with (plan / "session.yaml").open("a") as stream:
@@ -596,6 +603,8 @@ def test_points_are_recorded_three_coordinates_at_once(tracked):
         recording.read(again, points[1])
         with pytest.raises(SessionError, match="100000"):
             recording.read(again, np.array([0.0, 0.0, 101.0]))
+        with pytest.raises(SessionError, match="reading_mm is nan"):
+            recording.read(again, np.array([0.0, 0.0, np.nan]))
     session = load_session(folder)
     assert session.values[:24].reshape(8, 3) == pytest.approx(points, abs=1e-12)
     assert session.values[24:26] == pytest.approx(dial, abs=1e-12)
