@@ -224,6 +224,18 @@ def test_a_robot_without_adjustments_is_refused():
         plan_adjustments(identified(session_of("table1/experiment-2"), "offsets"))
 
 
+def test_an_adjustment_by_nothing_is_none(machines, tmp_path):
+    _, calibration = machines[8]
+    write_calibration(calibration, tmp_path / "calibration.json")
+    foot = find_adjustments(calibration.robot)[0].name
+    texts = []
+    for words in ((), ("--adjusted", f"{foot}=0")):
+        code, out, _ = run("again", tmp_path, *words, "--out", tmp_path / "new", "--force")
+        assert code == 0
+        texts.append((out, (tmp_path / "new/session.yaml").read_text()))
+    assert texts[0] == texts[1]
+
+
 def test_an_unknown_adjustment_is_named(machines):
     _, calibration = machines[8]
     foot = find_adjustments(calibration.robot)[0].name
