@@ -69,6 +69,10 @@ class SessionError(OrthocalError):
     """A session, its YAML or its CSV is invalid."""
 
 
+class UnreachablePostureError(SessionError):
+    """The machine does not reach a posture of a session."""
+
+
 class UnreachablePathError(SessionError):
     """The tool cannot follow its path to a posture of a setup.
 

@@ -234,6 +234,21 @@ def test_offsets_are_changes_if_no_session_states_the_active_ones(experiment, tm
     assert "x_slide -0.527 mm" in text
 
 
+def test_again_with_a_session_states_the_backlash_of_the_calibration(experiment, tmp_path):
+    """The session names the rows only; its controller may have compensated nothing."""
+    first = shutil.copytree(experiment, tmp_path / "first")
+    text = (first / "session.yaml").read_text()
+    text = re.sub(r"(?m)^controller: {", "controller: {backlash_mm: [0.03, 0.02, 0.01], ", text)
+    (first / "session.yaml").write_text(text)
+    assert orthocal("calibrate", first, "--out", tmp_path / "one")[0] == 0
+    words = ("--session", experiment, "--out", tmp_path / "second")
+    code, text, err = orthocal("again", tmp_path / "one", *words)
+    assert code == 0, err
+    second = load_plan(tmp_path / "second")
+    assert [t.backlash for t in second.compensation] == pytest.approx([3e-5, 2e-5, 1e-5])
+    assert "x_slide" in text.partition("compensates this backlash")[2]
+
+
 def test_printed_json_is_the_file_with_decision_and_findings(written, tmp_path):
     folder, (_, out, _) = written
     printed = json.loads(out)

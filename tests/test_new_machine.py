@@ -324,6 +324,23 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     assert files_of(copied) == before
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        *("--hours 2", "--effects none", "--effects thermal", "--paper", "--model offsets"),
+        *("--screw-lead-mm 5", "--temperature 20:28", "--gauge dial.yaml", "--with bar.yaml"),
+        *("--tolerance *.offset_mm=9", "--workspace-mm 50"),
+    ],
+)
+def test_options_of_a_plan_are_refused_with_again(copied, words):
+    before = files_of(copied)
+    code, _, err = orthocal("new", copied, "--again", *words.split())
+    option = words.split()[0]
+    expected = f"orthocal: {option}: found with --again, which reads machine.yaml\n"
+    assert (code, err) == (2, expected)
+    assert files_of(copied) == before
+
+
 def test_a_renamed_directory_works(copied):
     """machine.yaml is not the robot's; the files keep their names, also if made again."""
     before = load_robot(copied)
@@ -377,6 +394,18 @@ def test_a_plan_out_of_reach_is_old(copied):
     assert code == 3
     assert "it has readings, so check the dimensions" in err
     assert "--force" not in err
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [("plan.json", "5"), ("plan.json", "null"), ("plan.json", "{"), ("session.yaml", "robot: [")],
+)
+def test_a_damaged_plan_is_not_called_out_of_reach(copied, file, content):
+    (copied / "first" / file).write_text(content)
+    code, _, err = orthocal("new", copied, "--again")
+    assert code == 2
+    assert err.startswith(f"orthocal: {copied}/first/{file}:")
+    assert "does not reach" not in err
 
 
 def test_existing_files_are_not_overwritten(copied):

@@ -46,7 +46,12 @@ from orthocal.calibration.calibration import (
     propagate_stds,
     require_calibration,
 )
-from orthocal.effects.adjustment import LEVER_SHARE, Adjustment, find_adjustments
+from orthocal.effects.adjustment import (
+    LEVER_SHARE,
+    Adjustment,
+    find_adjustments,
+    require_adjustment,
+)
 from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.statistics import chance
@@ -134,10 +139,12 @@ def plan_adjustments(
 
     Raises:
         RobotError: If the robot declares no adjustments, or has no tool that its drives command.
-        ParameterError: If the noise of the readings is unknown.
+        ParameterError: If a name is unknown, or the noise of the readings.
         ClosureError: If the machine cannot reach its workspace.
     """
     require_calibration(calibration)
+    for name in among or ():
+        require_adjustment(calibration.robot, name, where="among", error=ParameterError)
     candidates = [
         a for a in find_adjustments(calibration.robot) if among is None or a.name in among
     ]

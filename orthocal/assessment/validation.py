@@ -56,10 +56,12 @@ from orthocal.estimation.fit import Fit
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
+from orthocal.measurement.files.session_keys import OFFSET_KEYS, keys_for_unit
 from orthocal.measurement.joining import (
     Given,
     gather_sessions,
     join_sessions,
+    list_members,
     on_one_printer,
     require_same_tolerances,
 )
@@ -378,7 +380,7 @@ def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
         SessionError: If a session belongs to the calibration; it names the session.
     """
     record = calibration.session
-    for session in sessions:
+    for session in (member for one in sessions for member in list_members(one)):
         if any(session.was_read_from(part.sha256) for part in (record, *record.parts)):
             raise SessionError(
                 "belongs to the calibration itself; expected a session measured afterwards",
@@ -421,7 +423,8 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
             continue
         if abs(active - entry.enter) > max(ALLOWED_STDS * entry.std_scatter, ROUNDING):
             factor, unit = entry.edge_factor, entry.edge_unit
-            where = f"{session.path or 'session'}: controller.offsets_{unit}"
+            keys = " or ".join(keys_for_unit(OFFSET_KEYS, entry.unit))
+            where = f"{session.path or 'session'}: controller.{keys}"
             differences.append(
                 f"{entry.drive} has {active * factor:g} {unit} instead of "
                 f"{entry.enter * factor:.3f} {unit}"

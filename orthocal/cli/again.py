@@ -76,7 +76,9 @@ def again(
     new = _plan_again(result, session, amounts)
     joints = None
     if ini is None:
-        new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
+        new = replace(
+            new, compensation=compensation_to_enter(result) or result.session.compensation
+        )
     else:
         joints = read_controller_joints(ini, result.robot)
         new = replace(new, compensation=joints.compensation)
@@ -256,7 +258,7 @@ def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:
 def _read_amounts(
     calibration: orthocal.Calibration, text: str | None, *, anyway: bool
 ) -> dict[str, float]:
-    """Amounts of the adjustments of the option `--adjusted`, [m], by name.
+    """Amounts of the adjustments of the option `--adjusted`, [m], by name, without zeros.
 
     Raises:
         ParameterError: If the text is not NAME=MM, or a name is unknown or stated twice.
@@ -277,7 +279,8 @@ def _read_amounts(
         require_adjustment(calibration.robot, name, where=where, error=ParameterError)
         amount = read_number(value, where, name)
         require_between(amount, -LARGEST_AMOUNT_MM, LARGEST_AMOUNT_MM, where)
-        amounts[name] = amount * MM
+        if amount:
+            amounts[name] = amount * MM
     return amounts
 
 

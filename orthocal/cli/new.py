@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,8 +31,14 @@ from orthocal.cli.options import (
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import following_command, note_beyond_limits
-from orthocal.errors import OrthocalError, ParameterError, RobotError
-from orthocal.io.files import exists, read_file, require_plain_name, write_files
+from orthocal.errors import (
+    ClosureError,
+    ParameterError,
+    RobotError,
+    UnreachablePathError,
+    UnreachablePostureError,
+)
+from orthocal.io.files import exists, require_plain_name, write_files
 from orthocal.text import quote_path
 
 if TYPE_CHECKING:
@@ -163,6 +168,14 @@ class FirstPlanOptions:
     temperature: TemperatureRange = None
     tolerance: Tolerances = None
 
+    def changed(self) -> dict[str, object]:
+        """Values that differ from their defaults, by option."""
+        return {
+            f"--{f.name.strip('_').replace('_', '-')}": value
+            for f in fields(self)
+            if (value := getattr(self, f.name)) != f.default
+        }
+
     def read_effects(self) -> dict[str, dict[str, float]]:
         """Effects of the machine, mapped to keys that replace their defaults."""
         effects: dict[str, dict[str, float]] = {
@@ -196,7 +209,7 @@ def new(
     """
     if again:
         stated: dict[str, object] = {o: text for o, text in dimensions.by_key().values()}
-        stated |= {"--kind": dimensions.kind, "--workspace-mm": options.workspace_mm}
+        stated |= {"--kind": dimensions.kind} | options.changed()
         _require_none(stated | {"--backlash": controller.backlash, "--ini": controller.ini})
         _make_again(folder)
         return
@@ -555,7 +568,11 @@ def _count_readings(folder: Path) -> int:
 
 
 def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
-    """Make the sheet of a plan without readings again; changes that make the plan outdated."""
+    """Make the sheet of a plan without readings again; changes that make the plan outdated.
+
+    Raises:
+        OrthocalError: If the plan does not load for another reason than postures out of reach.
+    """
     from orthocal.output.sheet.page import sheet_files
 
     try:
@@ -570,7 +587,7 @@ def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
         write_files(sheet.parent, sheet_files(session, following=following))
         put_out(f"Made {sheet} and its programs again.")
         return _changes_since(sheet.parent, robot)
-    except OrthocalError as e:
+    except (ClosureError, UnreachablePathError, UnreachablePostureError) as e:
         put_note(f"orthocal: {e}")
         return ["the machine does not reach its postures"]
 
@@ -579,17 +596,17 @@ def _changes_since(folder: Path, robot: orthocal.Robot) -> list[str]:
     """Changes of travel and workspace since a plan was made.
 
     Raises:
-        OrthocalError: If plan.json is not readable.
+        RobotError: If plan.json is not readable.
     """
+    from orthocal.io.documents import read_json
     from orthocal.output.text.plan import PLAN_BASIS, describe_basis
 
     file = folder / "plan.json"
     if not exists(file):  # the paper's plan does not depend on travel and workspace
         return []
-    try:
-        before = json.loads(read_file(file, error=RobotError))
-    except ValueError:
-        raise RobotError("is not JSON", where=str(file)) from None
+    before = read_json(file, error=RobotError)
+    if not isinstance(before, dict):
+        raise RobotError("is not a file that orthocal plan wrote; plan again", where=str(file))
     now = describe_basis(robot)
     return [
         f"{words} changed"

@@ -68,10 +68,9 @@ rounds angles by 0.9e-8 rad."""
 
 
 def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> bool:
-    """True if two controllers have the same compensation."""
-    if not (one and other):
-        return not any(t.backlash or t.table is not None for t in one or other)
-    for a, b in zip(one, other, strict=True):
+    """True if two controllers have the same compensation; an empty one is none."""
+    none = (JointTrim(),) * len(one or other)
+    for a, b in zip(one or none, other or none, strict=True):
         positions = [t.table[:, 0] for t in (a, b) if t.table is not None]
         joints = np.concatenate([*positions, np.zeros(1)])
         if np.abs(a(joints) - b(joints)).max() > SAME_TRIM:

@@ -95,17 +95,26 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     )
 
 
+def list_members(session: Session) -> list[Session]:
+    """List of a session and, if it has the readings of sessions that were joined, of these."""
+    values = [r.value for part in session.parts for r in part.readings]
+    parts = session.parts if values == [r.value for r in session.readings] else ()
+    return [session, *(member for part in parts for member in list_members(part))]
+
+
 def require_another(session: Session, sessions: Sequence[Session]) -> None:
-    """Refuse a session that is one of those before it.
+    """Refuse a session that is one of those before it, or joined from one.
 
     Raises:
         SessionError: If it is.
     """
-    if any(session is other or session.was_read_from(other.sha256) for other in sessions):
-        raise SessionError(
-            "is the same session as one before it; its readings would count twice",
-            where=str(session.path or "session"),
-        )
+    before = [member for other in sessions for member in list_members(other)]
+    for member in list_members(session):
+        if any(member is other or member.was_read_from(other.sha256) for other in before):
+            raise SessionError(
+                "is the same session as one before it; its readings would count twice",
+                where=str(member.path or "session"),
+            )
 
 
 def on_one_printer(sessions: Sequence[Session], robot: Robot, homed: ArrayLike) -> list[Session]:

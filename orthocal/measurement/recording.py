@@ -339,11 +339,14 @@ class Recording:
             conditions: Conditions of the reading; those that are None do not change.
 
         Raises:
-            SessionError: If the reading is beyond the range of the gauge, if the row cannot have
-                the conditions, or if the plan states another approach.
+            SessionError: If the reading is NaN or beyond the range of the gauge, if the row cannot
+                have the conditions, or if the plan states another approach.
             OutputError: If the files cannot be written.
         """
         rows = [self.rows[i] for i in self.point(index)]
+        if np.isnan(value).any():
+            where = rows[0].label_with_cycle
+            raise SessionError("reading_mm is nan; expected a number", where=where)
         setups = [self.session.setups[row.setup] for row in rows]
         conditions = conditions or Conditions()
         readings_mm = []
@@ -451,7 +454,7 @@ class Recording:
             OutputError: If the files cannot be written.
         """
         dropped = self.dropped[line]
-        existing = [r.key for r in self.rows[: len(dropped)]]
+        existing = [self.rows[0].key] * len(dropped)  # fewer rows may remain than a point has
         self._apply(Change(done="added", rows=[*existing, *dropped]))
         return len(self.rows) - len(dropped)
 

@@ -27,7 +27,7 @@ from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.assessment.words.adjustment import HEADLINES
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.effects.adjustment import find_adjustments
-from orthocal.errors import RobotError
+from orthocal.errors import ParameterError, RobotError
 from orthocal.output.report.page import build_report
 from orthocal.output.text.adjustment import render_plan
 from orthocal.output.text.layout import to_text
@@ -222,6 +222,26 @@ def test_adjustments_with_uncertain_gain_are_details(plans):
 def test_a_robot_without_adjustments_is_refused():
     with pytest.raises(RobotError, match=r"orthocal\.adjustments"):
         plan_adjustments(identified(session_of("table1/experiment-2"), "offsets"))
+
+
+def test_an_adjustment_by_nothing_is_none(machines, tmp_path):
+    _, calibration = machines[8]
+    write_calibration(calibration, tmp_path / "calibration.json")
+    foot = find_adjustments(calibration.robot)[0].name
+    texts = []
+    for words in ((), ("--adjusted", f"{foot}=0")):
+        code, out, _ = run("again", tmp_path, *words, "--out", tmp_path / "new", "--force")
+        assert code == 0
+        texts.append((out, (tmp_path / "new/session.yaml").read_text()))
+    assert texts[0] == texts[1]
+
+
+def test_an_unknown_adjustment_is_named(machines):
+    _, calibration = machines[8]
+    foot = find_adjustments(calibration.robot)[0].name
+    for among in (["w_foot"], [foot, "w_foot"]):
+        with pytest.raises(ParameterError, match=r"among: 'w_foot' is not .*; adjustments: "):
+            plan_adjustments(calibration, among=among)
 
 
 def test_validation_expects_the_adjusted_machine(plan, machines, plans):

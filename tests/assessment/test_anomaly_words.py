@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import pytest
 
 from orthocal import load_session
 from orthocal.assessment.words.anomalies import _text, describe_anomalies
-from orthocal.assessment.words.remedies import advise_about_sessions
+from orthocal.assessment.words.remedies import advise, advise_about_sessions
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
+from orthocal.units import MM
 
 
 def describe_alternatives(session, explanation, alternative):
@@ -42,6 +44,23 @@ def test_every_kind_has_a_sentence(root, kind):
         parameters=(f"{drive}.offset",),
     )
     assert len(_text(session, explanation).split()) > 3
+
+
+@pytest.mark.parametrize(
+    ("stated", "change", "advised"),
+    [
+        (3001.400123, {"amount": 1e-3}, "write +3000.400123 instead of +3001.400123."),
+        (-3412.345678, {"factor": -1.0}, "write +3412.345678 instead of -3412.345678."),
+        (0.44, {"factor": -1.0}, "write -0.44 instead of +0.44."),
+    ],
+)
+def test_a_corrected_reading_has_the_micrometres_of_the_stated_one(root, stated, change, advised):
+    """Points are metres away from the zero of their station."""
+    session = load_session(root / "examples/raw-cycles")
+    first, *others = session.readings
+    session = replace(session, readings=(replace(first, value=stated * MM), *others))
+    explanation = Explanation("misread dial", "reading", rows=(0,), **change)
+    assert advised in advise(session, explanation)
 
 
 def test_offsets_of_a_session_are_not_compared_with_home_offset(root):

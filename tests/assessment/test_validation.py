@@ -262,7 +262,7 @@ def test_a_session_without_stated_offsets_has_the_offsets_after_the_entries(raw_
 def test_sessions_of_the_calibration_are_refused(experiment_3):
     session = session_of("table1/experiment-2")
     both = identified([session, experiment_3])
-    for used in (session, experiment_3):
+    for used in (session, experiment_3, join_sessions([experiment_3, session])):
         with pytest.raises(SessionError, match="belongs to the calibration itself"):
             validate_calibration(both, used)
 

@@ -28,7 +28,7 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
-from orthocal.measurement.joining import join_sessions
+from orthocal.measurement.joining import gather_sessions, join_sessions
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -72,6 +72,19 @@ def test_a_session_divided_into_two_gives_the_same_estimates(sweep, model, solve
     assert [r.measured for r in joined.residuals] == [r.measured for r in undivided.residuals]
     residuals = np.array([[r.residual for r in c.residuals] for c in (undivided, joined)])
     assert np.abs(residuals[0] - residuals[1]).max() < 1e-12
+
+
+def test_a_session_and_one_joined_from_it_do_not_count_twice(sweep, raw_cycles):
+    joined = join_sessions([sweep, raw_cycles])
+    for both in (
+        [joined, raw_cycles],
+        [replace(sweep, title="copy"), joined],
+        [joined, join_sessions([raw_cycles, sweep])],
+    ):
+        with pytest.raises(SessionError, match="is the same session as one before it"):
+            gather_sessions(both)
+    others = joined.with_values(joined.values + 1e-6)
+    assert gather_sessions([joined, others]) == [joined, others]
 
 
 def test_the_same_readings_again_halve_the_variance(raw_cycles):

@@ -94,6 +94,17 @@ def test_a_machine_without_compensation_has_none(folder, orthoglide):
     assert compensates_alike(found, ())
 
 
+def test_a_table_of_zeros_compensates_nothing():
+    """Stated or not, a controller without compensation adds nothing to a position."""
+    zeros = JointTrim(table=np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    trims = JointTrim(table=np.array([[0.0, 1e-6, 0.0], [0.1, 0.0, 0.0]]))
+    for other in ((), (JointTrim(), JointTrim())):
+        for table, same in ((zeros, True), (trims, False)):
+            assert compensates_alike((JointTrim(), table), other) is same
+            assert compensates_alike(other, (JointTrim(), table)) is same
+    assert compensates_alike((), ())
+
+
 @pytest.mark.parametrize("size", [MM, DEG])
 def test_backlash_as_written_is_the_same(size):
     """Rounded to 1e-6 mm or 1e-6 degrees, but not to 1e-4."""

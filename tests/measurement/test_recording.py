@@ -244,6 +244,13 @@ def test_what_the_gauge_cannot_show_is_not_taken(plan, value):
     load_plan(plan)
 
 
+def test_a_reading_is_a_number(plan):
+    with open_recording(plan) as r:
+        with pytest.raises(SessionError, match="yx zero: reading_mm is nan; expected a number"):
+            r.read(0, np.nan)
+        assert r.missing[0] == 0
+
+
 def test_the_only_row_stays(plan):
     (plan / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,\n")
     with (plan / "session.yaml").open("a") as stream:
@@ -596,6 +603,8 @@ def test_points_are_recorded_three_coordinates_at_once(tracked):
         recording.read(again, points[1])
         with pytest.raises(SessionError, match="100000"):
             recording.read(again, np.array([0.0, 0.0, 101.0]))
+        with pytest.raises(SessionError, match="reading_mm is nan"):
+            recording.read(again, np.array([0.0, 0.0, np.nan]))
     session = load_session(folder)
     assert session.values[:24].reshape(8, 3) == pytest.approx(points, abs=1e-12)
     assert session.values[24:26] == pytest.approx(dial, abs=1e-12)
@@ -612,6 +621,18 @@ def test_a_point_is_deleted_and_emptied_with_all_its_coordinates(tracked):
         assert (len(recording.rows), recording.count, recording.missing_count) == (23, 9, 6)
         recording.empty(0)
         assert [r.setup for r in recording.rows if r.is_read] == ["yx"]
+
+
+def test_a_deleted_point_comes_back_if_fewer_rows_remain(tracked):
+    """A point has three rows; those that remain are the two of the dial."""
+    folder, *_ = tracked
+    with open_recording(folder) as recording:
+        while len(recording.rows) > 2:
+            line = recording.rows[0].line
+            recording.drop(0)
+        index = recording.restore(line)
+        assert (index, recording.point(index)) == (2, [2, 3, 4])
+    assert len(load_plan(folder).readings) == 5
 
 
 def test_a_killed_recording_of_points_is_restored(tracked, monkeypatch):

@@ -13,9 +13,11 @@ from orthocal import load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
+from orthocal.assessment.words.remedies import advise_about_sessions
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.refit import repeat_fit
 from orthocal.errors import ParameterError, SessionError
+from orthocal.hypotheses.anomaly import Explanation
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
@@ -156,7 +158,8 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     assert predicted > 2.0 * found.rms_after
     assert achieved == pytest.approx(predicted, rel=0.2)
     wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
-    with pytest.raises(SessionError, match=r"controller.*: motor_a has 0 mrad instead of"):
+    keys = r"controller\.offsets_deg or offsets_mrad"
+    with pytest.raises(SessionError, match=rf"{keys}: motor_a has 0 mrad instead of"):
         validate_calibration(found, simulate_session(wrong, OFFSETS, seed=3).session)
 
 
@@ -194,6 +197,19 @@ def test_each_key_has_the_drives_of_its_kind(tmp_path):
     text = write_session(session, tmp_path / "copy").read_text()
     assert "offsets_mm: [1.0, 2.0]" in text
     assert "offsets_mrad: [52.35" in text
+
+
+def test_advice_names_the_keys_of_the_drive_that_is_concerned(tmp_path):
+    """orthocal writes offsets_mrad; the first drive has other keys than the turn."""
+    session = load_mixed(tmp_path, "{offsets_mm: [1, 2], offsets_mrad: [3]}")
+    for kind, drive, keys in (
+        ("offset of one drive", "lift", "`controller.offsets_mm`"),
+        ("offset of one drive", "turn", "`controller.offsets_deg` or `controller.offsets_mrad`"),
+        ("offsets not entered", "turn", "`controller.offsets_deg` or `controller.offsets_mrad`"),
+        ("backlash halved", "turn", "`controller.backlash_deg`"),
+    ):
+        explanation = Explanation(kind, "session", drives=(drive,), sessions=("",))
+        assert f"controller with {keys} of session " in advise_about_sessions(session, explanation)
 
 
 def test_printed_keys_of_mixed_drives_are_those_of_a_session(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -10,9 +10,10 @@ from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined, named
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
+from orthocal.measurement.files.session_keys import BACKLASH_KEYS, OFFSET_KEYS, keys_for_unit
 from orthocal.session.session import Reading, Session, split_label
 from orthocal.text import quote_path, spans
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import MM, Unit, format_fixed, trim_zeros
 
 
 def advise(session: Session, e: Explanation) -> str:
@@ -20,7 +21,8 @@ def advise(session: Session, e: Explanation) -> str:
     if e.scope == "reading" and (e.factor is not None or e.kind == "misread dial"):
         stated = session.readings[e.rows[0]].value / MM
         corrected = stated - (e.amount or 0.0) / MM if e.factor is None else stated * e.factor
-        return f"If so, write {corrected:+.6g} instead of {stated:+.6g}."
+        new, old = (trim_zeros(format_fixed(v, 6, sign=True)) for v in (corrected, stated))
+        return f"If so, write {new} instead of {old}."
     if e.kind == "reversed sign" and e.setups:
         reverse_direction = ""
         if all("direction" in session.setups[name].sensor.to_keys() for name in e.setups):
@@ -157,14 +159,16 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
     ):
         return _advise_other_offset(session, e)
     if e.kind != "machine changed":
-        number = "backlash" if e.kind.startswith("backlash") else "offsets"
-        key = _key_of_controller(session, number)
+        number, keys = "offsets", OFFSET_KEYS
+        if e.kind.startswith("backlash"):
+            number, keys = "backlash", BACKLASH_KEYS
+        key = _name_keys(session, keys, e)
         which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
         note = f" {OFFSETS_IN_LINUXCNC}" if number == "offsets" else ""
         if e.kind in ("backlash halved", "backlash entered twice"):
             note = " LinuxCNC's BACKLASH is the complete backlash."
         return (
-            f"Compare the {number} in the controller with `{key}` of {which}.{note} If the "
+            f"Compare the {number} in the controller with {key} of {which}.{note} If the "
             "session states wrong numbers, correct them there; otherwise enter the right ones and "
             "measure again."
         )
@@ -180,16 +184,26 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
     )
 
 
-def _key_of_controller(session: Session, number: str) -> str:
-    """Key of session.yaml that states the offsets or backlashes of the controller."""
-    return f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
+def _name_keys(session: Session, keys: Mapping[str, tuple[Unit, float]], e: Explanation) -> str:
+    """Keys of a session.yaml that may state the offsets or backlashes of the drives of an anomaly.
+
+    Args:
+        session: The session.
+        keys: OFFSET_KEYS or BACKLASH_KEYS.
+        e: The anomaly; without drives it concerns all of them.
+    """
+    units = dict.fromkeys(
+        d.unit for d in session.robot.drives if d.name in e.drives or not e.drives
+    )
+    names = [f"`controller.{key}`" for unit in units for key in keys_for_unit(keys, unit)]
+    return joined(names, "or")
 
 
 def _advise_other_offset(session: Session, e: Explanation) -> str:
     """Action after a drive that moved, or has another offset than the stated one."""
-    key = _key_of_controller(session, "offsets")
+    key = _name_keys(session, OFFSET_KEYS, e)
     return (
-        f"Compare the offsets in the controller with `{key}` of session {e.sessions[0]}. "
+        f"Compare the offsets in the controller with {key} of session {e.sessions[0]}. "
         f"{OFFSETS_IN_LINUXCNC} If they differ, state there those that were in the controller, and "
         "calibrate again. If they agree, the drive or its home switch has moved: "
         f"{_calibrate_present(session, e)}, and enter its offsets."

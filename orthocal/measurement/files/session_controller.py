@@ -12,7 +12,12 @@ from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.errors import SessionError
 from orthocal.io.fields import read_only
 from orthocal.measurement.files.linuxcnc_ini import read_comp_file
-from orthocal.measurement.files.session_keys import BACKLASH_KEYS, OFFSET_KEYS, ControllerKeys
+from orthocal.measurement.files.session_keys import (
+    BACKLASH_KEYS,
+    OFFSET_KEYS,
+    ControllerKeys,
+    keys_for_unit,
+)
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Drive, Robot
 from orthocal.units import Unit
@@ -159,7 +164,7 @@ def _read_drive_values(
         units.add(unit)
     for drive in robot.drives:
         if drive.unit not in units:
-            expected = " or ".join(k for k, (unit, _) in key_units.items() if unit == drive.unit)
+            expected = " or ".join(keys_for_unit(key_units, drive.unit))
             raise SessionError(
                 f"the {quantity} of drive {drive.name} is missing; add {expected}", where=where
             )

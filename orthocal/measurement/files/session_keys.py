@@ -5,6 +5,7 @@ The text of a validator's error is `key|problem` where the problem belongs to on
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
@@ -78,6 +79,11 @@ BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
     "backlash_deg": ("rad", DEG),
 }
 """Backlash keys of `controller`: SI unit of their drives and factor to SI."""
+
+
+def keys_for_unit(keys: Mapping[str, tuple[Unit, float]], unit: Unit) -> list[str]:
+    """Keys of OFFSET_KEYS or BACKLASH_KEYS for drives with a unit; a session states one of them."""
+    return [key for key, (of_drives, _) in keys.items() if of_drives == unit]
 
 
 class GaugeKeys(Keys):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError, SessionError, UnreachablePostureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.session_controller import KINDS, require_count
@@ -77,7 +77,7 @@ def build_postures(
             _check_travel(robot, drives - active, where=where, posture=name)
         closure.close(np.array(list(commanded.values())), names=list(commanded))
     except ClosureError as e:
-        raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
+        raise UnreachablePostureError(e.reason, where=f"{file}: postures.{e.posture}") from None
     return {
         name: Posture(name, form, read_only(values), read_only(commanded[name] - active))
         for name, (form, values) in stated.items()
@@ -133,14 +133,14 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, posture: str | Non
         posture: Name of the posture, if the key does not contain it.
 
     Raises:
-        SessionError: If a drive does not reach its coordinate; the message has the joint
+        UnreachablePostureError: If a drive does not reach its coordinate; the message has the joint
             coordinates of the controller.
     """
     prefix = "" if posture is None else f"in posture '{posture}' "
     for drive, value in zip(robot.drives, drives, strict=True):
         if drive.is_beyond(value):
             low, high = drive.joint_limits
-            raise SessionError(
+            raise UnreachablePostureError(
                 f"{prefix}{drive.name} would be at {drive.show(float(drive.to_joint(value)))}; it "
                 f"reaches from {low / drive.joint_size:g} to {drive.show(high, 'g')}",
                 where=where,
