@@ -271,8 +271,8 @@ class Dialogue:
     def _is_doubtful(self, index: int) -> bool:
         """Print the prediction of a reading; True if the reading contradicts it.
 
-        Each coordinate of a point is also predicted by the other two. Readings with a warning are
-        excluded from the prediction.
+        Each coordinate of a point is predicted by the other points, so that one wrong coordinate
+        does not change the predictions of the others. Readings with a warning are excluded.
         """
         return any([self._contradicts(i) for i in self._recording.point(index)])
 
@@ -282,8 +282,7 @@ class Dialogue:
             return False
         rows = self._recording.rows
         excluded = self._rows_with_warning() - set(self._recording.point(index))
-        session = self._recording.measured(without=excluded)
-        position = sum(r.is_read and i not in excluded for i, r in enumerate(rows[:index]))
+        session, position = self._recording.measured_coordinate(index, without=excluded)
         try:
             mean, std = linear_model(session).compare_row(session.values, position)
         except (OrthocalError, np.linalg.LinAlgError) as e:

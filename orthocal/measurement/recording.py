@@ -286,14 +286,39 @@ class Recording:
     def measured(self, *, without: Collection[int] = ()) -> Session:
         """Session with the rows that were read; alignment postures remain the planned ones.
 
+        Points without excluded rows locate their station. If they do not determine it, all do.
+
         Args:
             without: Indices of rows to exclude.
         """
         session = replace(self.session, readings=self.rows, sha256="")
+        session = locate_stations(session, partial=True)
         read = [row for i, row in enumerate(self.rows) if row.is_read and i not in without]
         if len(read) < len(self.rows):
             session = session.select(read)
-        return locate_stations(session, partial=True)
+        return locate_stations(session, partial=True) if without else session
+
+    def measured_coordinate(
+        self, index: int, *, without: Collection[int] = ()
+    ) -> tuple[Session, int]:
+        """Session as by `measured` in which a row is the only one of its point.
+
+        The other points locate the station, if they determine it.
+
+        Args:
+            index: Index of the row.
+            without: Indices of rows to exclude.
+
+        Returns:
+            The session, and the index of the row in it.
+        """
+        session = self.measured(without=without)
+        point = self.point(index)
+        if len(point) > 1:
+            excluded = {*without, *point} - {index}
+            read = [r for i, r in enumerate(self.rows) if r.is_read and i not in excluded]
+            session = locate_stations(session.select(read), partial=True)
+        return session, session.readings.index(self.rows[index])
 
     @property
     def is_located(self) -> bool:

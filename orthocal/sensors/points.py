@@ -27,7 +27,7 @@ import numpy as np
 import pinocchio as pin
 from pydantic import Field
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number
 from orthocal.robot.model import Robot
@@ -51,6 +51,16 @@ LARGEST_MM = 100_000.0
 ABOUT_FIT = 20 * MM, 50 * MRAD
 """Prior standard deviations of an unknown frame about the best fit, [m] and [rad]: ten times the
 changes of the fit by errors of the machine."""
+
+GROSS_RESIDUAL = 1 * MM
+"""RMS residual of a station's fit, [m], up to which no point is excluded. Linearising about such a
+fit errs by micrometres."""
+
+GROSS_RATIO = 0.1
+"""Largest ratio of the RMS residuals without and with excluded points."""
+
+FEWEST_CONSISTENT = 4
+"""Fewest points of a fit without others. Three fit almost any other three."""
 
 AXES = "xyz"
 
@@ -283,6 +293,8 @@ def read_covariance(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Tr
 def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
     """Pose of a station with the best fit of points to targets (Kabsch, 1976).
 
+    Points that contradict the others grossly are excluded; see `_consistent_points`.
+
     Args:
         points: Points in the frame of the station, shape (n, 3), [m].
         targets: Targets in the world frame, shape (n, 3), [m].
@@ -293,17 +305,78 @@ def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
     Raises:
         SessionError: If the points do not determine the pose.
     """
-    seen, true = points - points.mean(axis=0), targets - targets.mean(axis=0)
-    singular_values = np.linalg.svd(seen, compute_uv=False)
-    if len(points) < 3 or not singular_values[1] > 1e-3 * singular_values[0]:
+    if not _determine_pose(points):
         raise SessionError(
             "unknown, but the points lie on a line; expected three or more points that do not",
             where="frame",
         )
+    if len(consistent := _consistent_points(points, targets)) < len(points):
+        points, targets = points[consistent], targets[consistent]
+    seen, true = points - points.mean(axis=0), targets - targets.mean(axis=0)
     u, _, vh = np.linalg.svd(seen.T @ true)
     rotation = vh.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vh.T @ u.T))]) @ u.T
     position = targets.mean(axis=0) - rotation @ points.mean(axis=0)
     return triple(position.tolist()), triple(pin.log3(rotation).tolist())
+
+
+def _determine_pose(points: Array) -> bool:
+    """True for three or more points that do not lie on a line."""
+    singular_values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return len(points) >= 3 and bool(singular_values[1] > 1e-3 * singular_values[0])
+
+
+def _consistent_points(points: Array, targets: Array) -> Indices:
+    """Indices of the points without those that contradict the others grossly.
+
+    Points are removed one by one, each time the one without which the RMS residual is smallest.
+    A removal applies if the RMS residual was above GROSS_RESIDUAL and falls below GROSS_RATIO of
+    it. Errors of the machine change smoothly with the position, so that no removal does this.
+
+    Args:
+        points: Points in the frame of the station, shape (n, 3), [m].
+        targets: Targets in the world frame, shape (n, 3), [m].
+    """
+    consistent = remaining = np.arange(len(points))
+    residuals = _rms_residuals(points, targets)
+    residual = residuals[0]
+    fewest = max(FEWEST_CONSISTENT, len(points) - len(points) // 3)
+    while residual > GROSS_RESIDUAL and len(remaining) > fewest:
+        remaining = np.delete(remaining, int(np.argmin(residuals[1:])))
+        if not _determine_pose(points[remaining]):
+            break
+        residuals = _rms_residuals(points[remaining], targets[remaining])
+        if residuals[0] < GROSS_RATIO * residual:
+            consistent, residual = remaining, residuals[0]
+    return consistent
+
+
+def _rms_residuals(points: Array, targets: Array) -> Array:
+    """RMS residuals of the best fits to all points, and to all without each of them.
+
+    With the centred points p and targets q, H = Σ p qᵀ and its singular values σ, the squared
+    residuals of the best fit sum to Σ |p|² + Σ |q|² − 2 (σ1 + σ2 + sign(det H) σ3). Without one of
+    n points, the sums lose n / (n − 1) times its terms.
+
+    Args:
+        points: Points in the frame of the station, shape (n, 3), [m].
+        targets: Targets in the world frame, shape (n, 3), [m].
+
+    Returns:
+        Residual with all points, then without each, shape (n + 1,), [m].
+    """
+    seen, true = points - points.mean(axis=0), targets - targets.mean(axis=0)
+    terms = seen[:, :, None] * true[:, None, :]
+    squares = np.sum(seen**2 + true**2, axis=1)
+    count = np.full(len(points) + 1, len(points) - 1)
+    count[0] += 1
+    loss = len(points) / count
+    loss[0] = 0.0
+    products = terms.sum(axis=0) - loss[:, None, None] * np.concatenate([terms[:1], terms])
+    sums = squares.sum() - loss * np.concatenate([squares[:1], squares])
+    singular_values = np.linalg.svd(products, compute_uv=False)
+    singular_values[:, 2] *= np.sign(np.linalg.det(products))
+    squared = sums - 2.0 * singular_values.sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0) / count))
 
 
 def _unit(i: int) -> Triple:

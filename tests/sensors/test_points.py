@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from calibrated import SOUND
+from commands import orthocal
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM, SAME_NUMBER
 
-from orthocal import calibrate, draw_errors, load_plan, load_session, write_session
+from orthocal import calibrate, check_session, draw_errors, load_plan, load_session, write_session
 from orthocal.errors import SessionError
 from orthocal.kinematics.workspace import cube
+from orthocal.measurement.files.point_rows import locate_stations
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
 from orthocal.sensors.points import fit_station
+from orthocal.units import MM
 
 SIGMA = 10e-6
 TARGET_MM = (3.0, -4.0, -40.0)
 ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.5e-3}
+STATION = (2.0, 1.5, -0.4)
+"""Position of a tracker, [m]."""
+
+PREDICTED_MM = 0.1
+"""[mm] Predictions of points by eight others: ten times their standard deviation."""
+
 COVARIANCE_UM2 = [[90.0, 40.0, -10.0], [40.0, 60.0, 5.0], [-10.0, 5.0, 400.0]]
 
 
@@ -75,6 +85,78 @@ def test_the_station_is_that_of_scipy():
     np.testing.assert_allclose(position, middle[1] - expected.apply(middle[0]), atol=SAME_NUMBER)
     with pytest.raises(SessionError, match="line"):
         fit_station(np.outer(np.arange(4.0), [1.0, 2.0, 0.5]), targets[:4])
+
+
+@pytest.mark.parametrize("wrong", [[4], [0, 7]])
+def test_grossly_wrong_points_do_not_move_the_station(wrong):
+    """Reversed signs and an error of 100 mm; the residuals of the others are 0.2 mm."""
+    rng = np.random.default_rng(2)
+    targets = rng.uniform(-0.05, 0.05, size=(9, 3))
+    turned = Rotation.from_rotvec([0.1, 0.2, -0.3])
+    points = turned.inv().apply(targets - STATION) + 0.2e-3 * rng.normal(size=(9, 3))
+    expected = fit_station(np.delete(points, wrong, axis=0), np.delete(targets, wrong, axis=0))
+    mistyped = points.copy()
+    mistyped[wrong[0], 2] *= -1.0
+    mistyped[wrong[1:], 0] += 0.1
+    assert fit_station(mistyped, targets) == expected
+    assert fit_station(points, targets) != expected
+
+
+def tracked(folder):
+    """Session of a tracker at STATION, and its points, shape (27, 3), [mm]."""
+    plan = grid(folder)
+    setups = {
+        n: replace(s, sensor=replace(s.sensor, position=STATION, rotation=(0.1, 0.2, -0.3)))
+        for n, s in plan.setups.items()
+    }
+    session = simulate_session(replace(plan, setups=setups), {"x_slide.offset": 1e-3}, seed=4)
+    return session.session, session.session.values.reshape(27, 3) / MM
+
+
+@pytest.mark.parametrize(
+    ("point", "axis", "factor", "kind"),
+    [
+        (8, 2, -1.0, "reversed sign"),
+        (13, 0, -1.0, "reversed sign"),
+        (20, 1, 0.1, "decimal point"),
+        (5, 0, 1.03, "outlier"),
+    ],
+)
+def test_check_names_a_mistyped_point_alone(tmp_path, point, axis, factor, kind):
+    session, points = tracked(tmp_path)
+    values = session.values
+    values = np.where(np.arange(81) == 3 * point + axis, factor * values, values)
+    write_session(session.with_values(values), tmp_path / "session", decimals=6)
+    findings = [
+        f
+        for f in check_session(load_session(tmp_path / "session")).findings
+        if f.severity != "note"
+    ]
+    assert [(f.kind, f.places[0].line) for f in findings] == [(kind, point + 2)]
+    expected = points[point, axis]
+    assert findings[0].numbers["expected_mm"] == pytest.approx(expected, abs=PREDICTED_MM)
+
+
+@pytest.mark.parametrize("mistype", [[1.0, 1.0, -1.0], [1.01, 1.0, 1.0], [1.05, 1.0, 1.0]])
+def test_a_mistyped_coordinate_does_not_change_the_predictions_of_the_others(tmp_path, mistype):
+    """After nine points of 27, the wrong one is the last."""
+    session, points = tracked(tmp_path)
+    write_session(session, tmp_path / "session", blank=True)
+    typed = [*points[:8], points[8] * mistype]
+    lines = "".join(" ".join(f"{v:.4f}" for v in point) + "\n" for point in typed)
+    _, out, _ = orthocal("record", tmp_path / "session", typed=lines + "quit\n")
+    predicted = re.findall(r"predict ([xyz]) (\S+) ±", out)[-3:]
+    assert [axis for axis, _ in predicted] == ["x", "y", "z"]
+    assert [float(v) for _, v in predicted] == pytest.approx(points[8], abs=PREDICTED_MM)
+    wrong = "xyz"[int(np.argmax(np.abs(np.subtract(mistype, 1.0))))]
+    assert re.findall(r"! Line 10 ([xyz]) differs", out) == [wrong]
+
+
+def test_points_without_all_coordinates_do_not_locate_the_station(tmp_path):
+    session, _ = tracked(tmp_path)
+    rows = [r for r in session.readings if r.setup != "track[x]"]
+    located = locate_stations(session.select(rows), partial=True)
+    assert located.setups["track[y]"].sensor.position == STATION
 
 
 def test_principal_axes_weigh_points_by_their_covariance(tmp_path):

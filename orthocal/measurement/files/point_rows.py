@@ -196,7 +196,7 @@ def locate_stations(session: Session, *, partial: bool = False) -> Session:
     """Session whose stations of unknown frame start at the best fit to the nominal machine.
 
     Args:
-        session: The session; empty rows are ignored.
+        session: The session; empty rows and points without all coordinates are ignored.
         partial: Whether points may be missing; a station that they do not determine is not changed.
 
     Raises:
@@ -213,7 +213,7 @@ def locate_stations(session: Session, *, partial: bool = False) -> Session:
     contacts = locate_contacts(session)
     for part in gather_points(session.readings, session.setups):
         sensor = unknown.get(part[0].setup)
-        if sensor is None or any(np.isnan(r.value) for r in part):
+        if sensor is None or len(part) < len(COORDINATES) or any(np.isnan(r.value) for r in part):
             continue
         postures, contact = contacts[part[0].setup]
         points, targets, _ = by_station.setdefault(
