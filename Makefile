@@ -9,6 +9,9 @@
 PYTHON ?= python3
 VENV ?= .venv
 SESSION ?= examples/table1/experiment-2
+# what `make test` runs; continuous integration runs the acceptance tests and the benchmarks, too
+MARKS ?= not smoke and not acceptance
+BESIDE ?=
 # one more than there are cores: some tests wait for pages and processes
 WORKERS ?= $(shell expr 1 + `getconf _NPROCESSORS_ONLN`)
 
@@ -34,14 +37,15 @@ calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED)
-	$(MAKE) --jobs 2 --output-sync check compiled
+	@# two processes at first: a benchmark compares times
+	$(MAKE) --jobs 2 --output-sync check $(BESIDE) compiled
 	$(MAKE) suite
 
 compiled: $(TESTED)  # the tests, once for all workers
 	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
 
 suite: $(TESTED)
-	$(PYTEST_IN_PARALLEL) -m "not smoke and not acceptance"
+	$(PYTEST_IN_PARALLEL) -m "$(MARKS)"
 
 acceptance: $(TESTED)
 	$(PYTEST_IN_PARALLEL) -m acceptance
