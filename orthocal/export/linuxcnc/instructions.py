@@ -190,9 +190,9 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
             f"**Backlash:** {listed}.\nLinuxCNC compensates it by the lines BACKLASH, or by the "
             f"columns of COMP_FILE. {'The module' if module else 'HOME_OFFSET'} contains half of\n"
             "the backlash, with the sign of HOME_LATCH_VEL"
-            f"{': HOME_OFFSET does not change' if module else ''}. HOME_LATCH_VEL must\n"
-            "have the signs stated here. If one differs, do not change it: export again with "
-            "`--ini`."
+            f"{': HOME_OFFSET does not change' if module else ''}. The numbers\n"
+            "are for the signs stated here. If one differs in your INI file, do not change it: "
+            "export again with `--ini`."
         )
         if not stated and any(map(_depends_on_latching, homes)):
             paragraphs[-1] += (

@@ -154,7 +154,7 @@ def _front(
     normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken. If "
-        "you must, read the setup in which it happened again.",
+        "you must home it again, repeat the interrupted setup.",
         f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
         f"differs by more than {_largest_difference(robot)}, the zero of the joint, a dimension or "
@@ -583,15 +583,15 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
         return (
             f"{AS_ARROWS_SHOW.format(length)}{_order_of_arrows(robot, arrows)} The programs do "
             f"this. If you jog, first move each joint to a number {length} smaller (↑) or larger "
-            "(↓) than that of the posture. Then move all joints to the posture in one motion. If a "
-            "joint went too far, begin the approach again."
+            "(↓) than that of the posture. Then move all joints to the posture, one after the "
+            "other or together. If a joint went too far, begin the approach again."
         )
     (arrow,) = arrows
     return (
         f"Approach every posture from the same side: in the last {length} "
         f"{_describe_arrow(robot, arrow)}. The programs do this. If you jog, begin {length} "
-        f"before the posture with every joint and move to it in one motion. {arcs}".rstrip()
-    )
+        f"before the posture with every joint and move each joint to it in one motion. {arcs}"
+    ).rstrip()
 
 
 def _order_of_arrows(robot: Robot, arrows: Collection[str]) -> str:
