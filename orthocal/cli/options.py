@@ -79,7 +79,7 @@ class CommandOnce(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - Click's types
         """Read the options; the last of several values would replace the others."""
-        _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        order: list[Any] = self.make_parser(ctx).parse_args(args=list(args))[2]
         remaining = super().parse_args(ctx, args)
         for option in order:
             if order.count(option) > 1 and not option.multiple:
