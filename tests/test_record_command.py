@@ -917,11 +917,13 @@ def test_points_are_recorded_and_compared_with_their_prediction(tmp_path, run):
     points[3] = points[3].round(2)
     typed[3] = "{:.2f} {:.2f} {:.2f}".format(*points[3]).replace(".", ",")
     slip = points[-1] + [0.0, 1.0, 0.0]
-    code, out, err = run(tmp_path, "", "1 2", *typed, forms[0].format(*slip), "back 9", "", "")
+    incomplete = ("1 2", "1, ,2", "1.5,,2", "1;2;")
+    last = forms[0].format(*slip), "back 9", "", ""
+    code, out, err = run(tmp_path, "", *incomplete, *typed, *last)
     assert (code, err) == (0, "")
     assert "Setup track, 1 of 1: 8 readings" in out
     assert "Not recorded: type x, y and z of the point" in out
-    assert "Not recorded: '1 2' is no point" in out
+    assert all(f"Not recorded: '{text}' is no point" in out for text in incomplete)
     differs = re.search(r"! Line 9 y differs by ([0-9.]+) mm\.", out)
     assert float(differs[1]) == pytest.approx(1.0, abs=0.1)
     recorded = [[float(row[f"{k}_mm"]) for k in "xyz"] for row in rows_of(tmp_path)]
