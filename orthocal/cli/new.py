@@ -210,7 +210,8 @@ def new(
     if again:
         stated: dict[str, object] = {o: text for o, text in dimensions.by_key().values()}
         stated |= {"--kind": dimensions.kind} | options.changed()
-        _require_none(stated | {"--backlash": controller.backlash, "--ini": controller.ini})
+        stated |= {"--backlash": controller.backlash, "--ini": controller.ini}
+        _require_none(stated | {"--force": force or None})
         _make_again(folder)
         return
     if options.paper and options.hours is not None:
