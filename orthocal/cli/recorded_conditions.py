@@ -10,7 +10,8 @@ from orthocal.errors import SessionError
 from orthocal.io.tables.numerals import plain_minus
 from orthocal.kinematics.conditions import APPROACH, find_approach_problem
 from orthocal.measurement.files.readings_checks import parse_temperature
-from orthocal.measurement.recording import RecordedReading, Recording
+from orthocal.measurement.recorded_rows import RecordedReading
+from orthocal.measurement.recording import Recording
 from orthocal.observation.conditions import needed_conditions
 from orthocal.session.session import Conditions
 

@@ -25,7 +25,8 @@ from orthocal.measurement.motion.approach import (
     label_reading,
 )
 from orthocal.measurement.motion.motion import guide, plan_motion, set_dial
-from orthocal.measurement.recording import RecordedReading, Recording
+from orthocal.measurement.recorded_rows import RecordedReading
+from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
