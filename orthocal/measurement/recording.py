@@ -39,7 +39,12 @@ from orthocal.measurement.recorded_rows import (
     find_dropped,
     recorded_rows,
 )
-from orthocal.measurement.recording_journal import CLOSED, find_pending, read_lines
+from orthocal.measurement.recording_journal import (
+    CLOSED,
+    NextConditions,
+    find_pending,
+    read_lines,
+)
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.protocol import largest_reading
 from orthocal.session.order import order_of_measurement
@@ -78,8 +83,8 @@ class Recording:
     """Digest of the CSV on disk."""
     dropped: dict[int, list[ReadingKey]]
     """Keys of the rows that earlier recordings deleted, by their line."""
-    temperature: float | None
-    """Temperature that was typed last, [°C]."""
+    following: NextConditions
+    """Conditions of the next readings that were typed last, also in earlier recordings."""
     restored: int
     """Number of changes that a killed recording had not written to the CSV."""
     edited: bool
@@ -307,14 +312,14 @@ class Recording:
         self._apply(Change(done="added", rows=[*existing, *dropped]))
         return len(self.rows) - len(dropped)
 
-    def note_temperature(self, temperature: float) -> None:
-        """Keep the temperature, [°C], of the next readings for the next recording.
+    def note(self, conditions: NextConditions) -> None:
+        """Keep stated conditions of the next readings, also for the next recording.
 
         Raises:
             OutputError: If the journal cannot be written.
         """
-        self.journal.append({"temperature_C": temperature})
-        self.temperature = temperature
+        self.journal.append(conditions.stated)
+        self.following = NextConditions(**self.following.stated | conditions.stated)
 
     def empty(self, index: int) -> None:
         """Delete all readings of a row's setup, with all that was typed; the journal has them.
@@ -426,7 +431,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             journal,
             _digest(table),
             find_dropped(session, [*closed, *(change for _, change in lines)]),
-            past.temperature,
+            past.following,
             len(pending),
             edited,
             wrong,

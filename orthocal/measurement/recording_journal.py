@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from orthocal.errors import OrthocalError
 from orthocal.io.documents import Keys, Number, validate
@@ -33,10 +33,22 @@ class JournalLine(Change):
     """Digest of the CSV after it."""
 
 
-class _Temperature(Keys):
-    """Line of the journal: temperature that is recorded with the next readings, [°C]."""
+class NextConditions(Keys):
+    """Line of the journal: conditions that were typed for the next readings."""
 
-    temperature: Annotated[Number, Field(alias="temperature_C")]
+    model_config = ConfigDict(populate_by_name=True)
+
+    temperature: Annotated[Number | None, Field(alias="temperature_C")] = None
+    """Temperature, [°C]."""
+    approach: str | None = None
+    """Approach; see `Conditions`."""
+    clock: bool | None = None
+    """Whether the time of each reading is noted."""
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The stated conditions by their keys in the journal."""
+        return self.model_dump(exclude_none=True, by_alias=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,13 +59,13 @@ class Past:
     """Changes of the recordings that ended regularly."""
     lines: list[tuple[str, JournalLine]]
     """Later changes with their places."""
-    temperature: float | None
-    """Temperature that was typed last, [°C]."""
+    following: NextConditions
+    """Conditions that were typed last."""
 
 
 def read_lines(journal: Journal) -> Past:
     """Content of a journal; a new one gets its header."""
-    temperature = None
+    following = NextConditions()
     closed: list[JournalLine] = []
     lines: list[tuple[str, JournalLine]] = []
     has_header = False
@@ -69,9 +81,9 @@ def read_lines(journal: Journal) -> Past:
             lines.clear()
         elif has_header:
             try:
-                if data is not None and data.keys() == {"temperature_C"}:
-                    noted = validate(_Temperature, data, where=where, error=OrthocalError)
-                    temperature = noted.temperature
+                if data and "done" not in data:
+                    noted = validate(NextConditions, data, where=where, error=OrthocalError)
+                    following = NextConditions(**following.stated | noted.stated)
                     continue
                 line = validate(JournalLine, data, where=where, error=OrthocalError)
             except OrthocalError:
@@ -84,7 +96,7 @@ def read_lines(journal: Journal) -> Past:
         has_header = True
     if not has_header:
         journal.append({"format": FORMAT})
-    return Past(closed, lines, temperature)
+    return Past(closed, lines, following)
 
 
 def find_pending(
