@@ -28,7 +28,7 @@ from orthocal.cli.options import (
     read_workspace,
     split_effects,
 )
-from orthocal.cli.overwriting import require_new_session
+from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import following_command, note_beyond_limits
 from orthocal.errors import (
@@ -317,7 +317,7 @@ def _write(folder: Path, name: str, design: _Design) -> None:
     robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(design.session, robot=robot, robot_reference=str(folder.resolve()))
     comment = COMMENT.format(calibrating=_calibrating())
-    orthocal.write_session(session, folder / FIRST, comment=comment, extra=design.files, blank=True)
+    write_plan(session, folder / FIRST, comment=comment, files=design.files)
 
 
 def _calibrating() -> str:
