@@ -211,11 +211,12 @@ def new(
         stated: dict[str, object] = {o: text for o, text in dimensions.by_key().values()}
         stated |= {"--kind": dimensions.kind} | options.changed()
         stated |= {"--backlash": controller.backlash, "--ini": controller.ini}
-        _require_none(stated | {"--force": force or None})
+        _require_none(stated | {"--force": force or None}, "--again, which reads machine.yaml")
         _make_again(folder)
         return
-    if options.paper and options.hours is not None:
-        raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
+    if options.paper:
+        free = {"--hours": options.hours, "--temperature": options.temperature}
+        _require_none(free | {"--with": options.with_}, "--paper, whose setups are fixed")
     name = _require_new(folder, force=force)
     design = _design(name, dimensions, options, controller)
     _write(folder, name, design)
@@ -349,11 +350,15 @@ def _make_trial(
         raise ParameterError(problem, where="--effects") from None
 
 
-def _require_none(options: Mapping[str, object]) -> None:
-    """Refuse options that --again reads from machine.yaml."""
+def _require_none(options: Mapping[str, object], other: str) -> None:
+    """Refuse stated options, which have no effect together with another one.
+
+    Raises:
+        ParameterError: If an option has a value.
+    """
     for option, value in options.items():
         if value is not None:
-            raise ParameterError("found with --again, which reads machine.yaml", where=option)
+            raise ParameterError(f"found with {other}", where=option)
 
 
 def _require_new(folder: Path, *, force: bool) -> str:
