@@ -75,6 +75,8 @@ def export(
             for drives with backlash. Default: + for all joints.
         ini (FILE): linuxcnc: INI file during the measurement: HOME_OFFSET, latching, soft limits.
     """
+    if ini is not None and to != "linuxcnc":
+        raise ParameterError("is an option of --to linuxcnc only", where="--ini")
     result = orthocal.load_calibration(calibration)
     stated = {"--home-offset": home_offset, "--latched": latched}
     joints = None if ini is None else _read_joints(ini, result, stated)
