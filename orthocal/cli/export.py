@@ -21,11 +21,7 @@ from orthocal.cli.options import (
     read_numbers,
     read_vector,
 )
-from orthocal.cli.overwriting import (
-    mark_written,
-    require_replaceable_results,
-    require_same_text,
-)
+from orthocal.cli.overwriting import mark_written, require_replaceable_results, require_same_text
 from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists

@@ -19,13 +19,7 @@ from orthocal.io.documents import Keys, Number
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM
 from orthocal.sensors.points import Coordinate
 from orthocal.session.points import base_name
-from orthocal.session.session import (
-    Conditions,
-    Reading,
-    ReadingKey,
-    Session,
-    known_approach,
-)
+from orthocal.session.session import Conditions, Reading, ReadingKey, Session, known_approach
 from orthocal.units import MM
 
 

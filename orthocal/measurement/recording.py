@@ -39,22 +39,12 @@ from orthocal.measurement.recorded_rows import (
     find_dropped,
     recorded_rows,
 )
-from orthocal.measurement.recording_journal import (
-    CLOSED,
-    NextConditions,
-    find_pending,
-    read_lines,
-)
+from orthocal.measurement.recording_journal import CLOSED, NextConditions, find_pending, read_lines
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.protocol import largest_reading
 from orthocal.session.order import order_of_measurement
 from orthocal.session.points import base_name, gather_points
-from orthocal.session.session import (
-    Conditions,
-    Reading,
-    ReadingKey,
-    Session,
-)
+from orthocal.session.session import Conditions, Reading, ReadingKey, Session
 from orthocal.units import MM, to_mm
 
 SUFFIX = ".journal"
