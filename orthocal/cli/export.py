@@ -135,10 +135,9 @@ def _note_assumptions(
     if assumes_latching(calibration, options):
         unstated = "" if ini is None else f" ({ini} does not state it for every joint)"
         put_note(
-            f"Assumed: HOME_LATCH_VEL of all joints is positive{unstated}. "
-            f"{'The module' if module else 'HOME_OFFSET'} contains half of the backlash with this "
-            f"sign. If it is negative, state the signs by {'--ini FILE or ' * (ini is None)}"
-            "--latched."
+            f"Assumed: HOME_LATCH_VEL of all joints is positive{unstated}. On its sign depends "
+            f"half of the backlash in {'the module' if module else 'HOME_OFFSET'}. If it is "
+            f"negative, state the signs by {'--ini FILE or ' * (ini is None)}--latched."
         )
 
 
