@@ -445,8 +445,8 @@ def _phases(robot: Robot, count: int) -> Array:
 
 def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator]]:
     """Names and indicators of all possible setups at a leg."""
-    for direction in directions_across(leg):
-        prefix = direction if isinstance(direction, str) else "d"
+    for i, direction in enumerate(directions_across(leg), 1):
+        prefix = direction if isinstance(direction, str) else f"d{i}"
         for fraction in equipment.sections:
             for sensor in equipment.list_sensors(leg, direction, fraction):
                 rod = "" if sensor.rod is None else f"_{sensor.rod}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import weakref
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from orthocal import (
     Choice,
     draw_errors,
     load_plan,
+    load_robot,
     load_session,
     simulate_session,
     summarize,
@@ -245,6 +247,16 @@ def test_further_setups_combine_with_the_measured_session(orthoglide, root):
     assert set(plan.session.setups).isdisjoint(measured.setups)
 
 
+@pytest.mark.parametrize("name", ["orthoglide", "inclined_orthoglide", "linear_delta"])
+def test_each_leg_is_read_in_two_directions(name):
+    """Each candidate is listed once, also at legs that no axis of the world is perpendicular to."""
+    robot = load_robot(name)
+    session = list_candidates(robot, Equipment(**FEW))
+    assert len({r.key for r in session.readings}) == len(session.readings)
+    sensors = [session.setups[n].sensor for n in {r.setup for r in session.readings}]
+    assert len({(s.leg, s.direction) for s in sensors}) == 2 * len(robot.legs)
+
+
 def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
     """Drives move from 120 to 390 mm and are at 310 mm in the mechanical zero: -190 to 79 mm, less
     a margin."""
@@ -269,6 +281,11 @@ def test_a_plan_uses_the_available_hours(orthoglide):
         ({"setups": 3, "readings": 5}, "readings: found 5; expected at least 6, 2 for each of 3"),
         ({"setups": 41}, "setups: found 41; expected 1 to 40"),
         ({"hours": 0.1}, "hours: found 0.1; expected at least 0.2"),
+        ({"hours": math.nan}, "hours: found nan; expected a positive number"),
+        (
+            {"hours": 1.0, "equipment": Equipment(minutes_per_setup=0, minutes_per_reading=0)},
+            "hours: found 1; expected .* at most 40 setups",
+        ),
         ({"hours": 1.0, "setups": 3}, "hours: found together with setups or readings"),
         (
             {"readings": 600, "setups": 2, "equipment": Equipment(**QUICK)},

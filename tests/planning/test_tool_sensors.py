@@ -41,6 +41,7 @@ from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
 from orthocal.output.text.plan import describe_absent, plan_json
+from orthocal.planning import plan as planning
 from orthocal.planning import planned_session, tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, equipment_of, place_tool
@@ -105,6 +106,28 @@ def planned(owned):
     equipment = Equipment(owned=sensors, **FEW)
     with few_balls(7), uncompared():
         return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
+
+
+def test_a_plan_from_a_better_usual_plan_takes_the_stated_time(owned, monkeypatch):
+    """A precise bar that takes 55 minutes would replace each setup of the usual plan."""
+    bar = "sensor: ball_bar\nlength_mm: 80\nsigma_mm: 0.0005\nminutes_per_setup: 55\n"
+    equipment = Equipment(owned=owned(bar=bar + "centre_tolerance_mm: 0.001\n"), **FEW)
+
+    def search_badly(timed, candidates, *_):
+        which = next(i for i, s in enumerate(candidates.setups) if s.gauge == "dial")
+        return timed.search.plan_of([PlannedSetup(which, (0, 1))] * 5)
+
+    monkeypatch.setattr(planning, "_search_setups", search_badly)
+    with few_balls(2):
+        plan = plan_readings(entered("orthoglide"), hours=1.0, equipment=equipment, starts=1)
+    assert plan.usual_plans
+    assert plan.minutes <= 60.0 + 1e-9
+
+
+def test_a_time_too_short_for_any_setup_is_refused(owned, orthoglide):
+    equipment = Equipment(owned=owned(bar=BAR), **FEW)
+    with few_balls(1), pytest.raises(ParameterError, match="found 3 min; expected at least"):
+        plan_readings(orthoglide, hours=0.05, equipment=equipment)
 
 
 def test_a_plan_beside_other_sensors_has_the_dial_of_the_legs(orthoglide):
