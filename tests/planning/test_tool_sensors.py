@@ -53,6 +53,7 @@ from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.planning.tool_candidates import list_tool_candidates, segment_distances
 from orthocal.sensors.ball_bar import SAGITTA, BallBar
 from orthocal.sensors.registry import read_setup
+from orthocal.session.points import names_in_files
 from orthocal.session.session import Gauge, Reading, Session, Setup
 
 BAR = """sensor: ball_bar
@@ -318,6 +319,22 @@ def test_a_plan_for_a_printer_is_measured_and_calibrated(for_printer):
     calibration = identified(readings)
     remaining = np.array([calibration[n].value - errors[n] for n in forecast.names])
     assert tool_rms(forecast, remaining) < 2.0 * for_printer.expected.reported.rms
+
+
+BESIDE_ZERO = np.array([[0.0226, 0.0726], [-0.0426, 0.0526], [-0.0826, -0.0226]])
+
+
+@pytest.mark.parametrize(("name", "box"), [("linear_delta", None), ("orthoglide", BESIDE_ZERO)])
+def test_the_tool_stays_in_the_box(owned, name, box):
+    """The workspace of the delta begins at its bed. The mechanical zero is beside the other box."""
+    robot = load_robot(name)
+    sensors = owned(bar=BAR, square=SQUARE, plate=PLATE, block=BLOCK, track=TRACKER)
+    with few_balls(2):
+        _, postures, setups, _ = list_tool_candidates(robot, sensors, box)
+    assert {names_in_files(s)[1] for s in setups.values()} == {s.name for s in sensors}
+    points = np.array([p.values for p in postures.values()])
+    low, high = (robot.workspace if box is None else box).T
+    assert ((points >= low - 1e-9) & (points <= high + 1e-9)).all()
 
 
 def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
