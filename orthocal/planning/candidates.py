@@ -26,7 +26,7 @@ from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_reachable
 from orthocal.planning.expected_error import ENTERED_OFFSET_STD
 from orthocal.planning.owned_sensors import DIAL
-from orthocal.planning.tool_candidates import list_tool_candidates
+from orthocal.planning.tool_candidates import PLACE, list_tool_candidates
 from orthocal.robot.model import Leg, Robot
 from orthocal.robot.parameters import is_offset
 from orthocal.sensors.direction import Direction
@@ -449,8 +449,8 @@ def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator
         prefix = direction if isinstance(direction, str) else f"d{i}"
         for fraction in equipment.sections:
             for sensor in equipment.list_sensors(leg, direction, fraction):
-                rod = "" if sensor.rod is None else f"_{sensor.rod}"
-                yield f"{prefix}{leg.name}{rod}_{fraction:g}", sensor
+                rod = "" if sensor.rod is None else f"{sensor.rod}_"
+                yield f"{prefix}{leg.name}{PLACE}{rod}{fraction:g}", sensor
 
 
 def directions_across(leg: Leg) -> list[Direction]:

@@ -66,6 +66,9 @@ SAME_ANGLE = 1e-6
 STEP = 5 * MM
 """Step of the positions, [m]."""
 
+PLACE = "@"
+"""Mark before the place of a sensor in the name of a candidate setup."""
+
 
 def list_tool_candidates(
     robot: Robot, owned: Sequence[OwnedSensor], box: Array | None
@@ -288,7 +291,7 @@ def _bars(
             "centre_mm": ((in_space + tool) / MM).round(6).tolist(),
             "ball": f"{sensor.name}_ball_{k + 1}",
         }
-        yield f"{sensor.name}_{k}", keys, points[inside]
+        yield f"{sensor.name}{PLACE}{k}", keys, points[inside]
 
 
 def _is_inclined(sensor: OwnedSensor, bars: Array) -> Mask:
@@ -342,7 +345,7 @@ def _edges(
                 "direction": "xyz"[direction],
                 "artefact": {**artefact, "along": "xyz"[along], "name": name},
             }
-            yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}_{k}", keys, points
+            yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}{PLACE}{k}", keys, points
 
 
 def _plates(
@@ -354,7 +357,7 @@ def _plates(
         for k, level in enumerate(LEVELS):
             points = _grid(middle, box, axis, length, PLATE_POINTS)
             points[:, axis] = _at_level(middle, box, axis, level)[axis]
-            yield f"{sensor.name}{'xyz'[axis]}_{k}", {"direction": f"-{'xyz'[axis]}"}, points
+            yield f"{sensor.name}{'xyz'[axis]}{PLACE}{k}", {"direction": f"-{'xyz'[axis]}"}, points
 
 
 def _blocks(

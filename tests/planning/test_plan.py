@@ -257,6 +257,16 @@ def test_each_leg_is_read_in_two_directions(name):
     assert len({(s.leg, s.direction) for s in sensors}) == 2 * len(robot.legs)
 
 
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_setups_are_named_after_their_legs(orthoglide):
+    """Also if the names of the legs end in numbers."""
+    legs = {f"leg_{i}": leg for i, leg in enumerate(orthoglide.legs.values(), 1)}
+    legs = {name: replace(leg, name=name) for name, leg in legs.items()}
+    with uncompared():
+        plan = plan_readings(replace(orthoglide, legs=legs), equipment=Equipment(**FEW), starts=1)
+    assert {s.name[1:] == s.sensor.leg for s in plan.session.setups.values()} == {True}
+
+
 def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
     """Drives move from 120 to 390 mm and are at 310 mm in the mechanical zero: -190 to 79 mm, less
     a margin."""

@@ -418,11 +418,11 @@ def test_no_rod_is_in_the_way_of_a_bar(owned, orthoglide, radius, clear):
     """Rods by Pinocchio. Without room for the bar itself, its axis passes them by 1 mm."""
     sensors = owned(bar=BAR + f"radius_mm: {radius}\n")
     _, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
-    read = [r for r in readings if r.setup == "bar_10"]
+    read = [r for r in readings if r.setup == "bar@10"]
     gaps = []
     for posture in (postures[r.posture] for r in read[::5]):
         found = frames(orthoglide, posture.drives)
-        bar = on_segments(found["tcp"][None], np.array([setups["bar_10"].sensor.centre]))
+        bar = on_segments(found["tcp"][None], np.array([setups["bar@10"].sensor.centre]))
         for rod in orthoglide.rods.values():
             ends = on_segments(found[rod.root][None], found[rod.tip][None])
             gaps.append(nearest(bar, ends)[0] - rod.radius)
@@ -708,7 +708,7 @@ def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
     session = list_candidates(
         entered("orthoglide"), Equipment(owned=owned(track=TRACKER + CORRELATED), **QUICK)
     )
-    dial = next(r for r in session.readings if r.setup == "yx_a_0.5")
+    dial = next(r for r in session.readings if r.setup == "yx@a_0.5")
     of_point = [r for r in session.readings if r.setup.startswith("track")][:12]
     few = replace(session, robot_reference="orthoglide").select([dial, *of_point])
     write_session(few, tmp_path / "few", blank=True)
