@@ -124,7 +124,10 @@ def _order_readings(
     if measured is None:
         return state_path_approaches(plan)
     plan = replace(
-        plan, compensation=measured.compensation, controller_origin=measured.controller_origin
+        plan,
+        compensation=measured.compensation,
+        controller_origin=measured.controller_origin,
+        adjusted=measured.adjusted,
     )
     if measured.controller_offsets is not None:
         plan = plan.with_controller(measured.controller_offsets)

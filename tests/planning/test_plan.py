@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from adjusting import shimmed_plan
 from bounds import rms_band
 from calibrated import identified
 from models import JOINTS
@@ -245,6 +246,18 @@ def test_further_setups_combine_with_the_measured_session(orthoglide, root):
     known = forecast.about_nominal(measured).reported.rms
     assert plan.curve[0].error == pytest.approx(factor * known, rel=1e-3)
     assert set(plan.session.setups).isdisjoint(measured.setups)
+
+
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_further_setups_have_the_adjustments_of_the_measured_session(tmp_path):
+    planned = shimmed_plan(tmp_path / "mine")
+    amounts = {next(iter(planned.robot.declared.adjustments)): 0.5e-3}
+    measured = replace(simulate_session(planned, {}).session, adjusted=amounts)
+    with uncompared():
+        plan = plan_readings(
+            planned.robot, setups=1, measured=measured, equipment=Equipment(**FEW), starts=1
+        )
+    assert plan.session.adjusted == amounts
 
 
 @pytest.mark.parametrize("name", ["orthoglide", "inclined_orthoglide", "linear_delta"])
