@@ -276,11 +276,10 @@ def measure_candidates(
             prior = prior @ prior.T + covariance[of_part, of_part]
             margin = spare_range * ratio * _prior_std(prior, absolute=absolute)
             margins.append(float(margin.max()))
-            limits, predicted = session.gauges[part.gauge].range, ratio * h[rows[of_part]]
-            if limits is not None:
-                middle = 0.5 * sum(limits) if absolute else None
-                span = margin + _distances(predicted, middle)
-                reachable &= span <= 0.5 * (limits[1] - limits[0])
+            gauge, predicted = session.gauges[part.gauge], ratio * h[rows[of_part]]
+            if gauge.range is not None:
+                span = margin + _distances(predicted, gauge.middle if absolute else None)
+                reachable &= span <= gauge.half_range
                 each = np.diag(span) if absolute else span
                 spans.setdefault(base, []).append(float(np.median(each)))
             zero = 0.0 if absolute or width == 1 else ZERO_PRIOR / ratio

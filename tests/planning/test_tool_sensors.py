@@ -125,6 +125,14 @@ def test_a_plan_from_a_better_usual_plan_takes_the_stated_time(owned, monkeypatc
     assert plan.minutes <= 60.0 + 1e-9
 
 
+def test_sensors_share_the_time_of_six_setups(owned, orthoglide):
+    """In whole minutes, too."""
+    equipment = Equipment(owned=owned(bar=BAR), minutes_per_setup=10, minutes_per_reading=1)
+    minutes = planning._counts_or_minutes(None, None, None, equipment, orthoglide)
+    assert isinstance(minutes, float)
+    assert minutes == 6 * (10 + 4)
+
+
 def test_a_time_too_short_for_any_setup_is_refused(owned, orthoglide):
     equipment = Equipment(owned=owned(bar=BAR), **FEW)
     with few_balls(1), pytest.raises(ParameterError, match="found 3 min; expected at least"):

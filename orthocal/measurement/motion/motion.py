@@ -140,8 +140,8 @@ class Stop:
     lift: str = ""
     """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
     expected: float = 0.0
-    """Reading of the nominal machine, [m]; relative to the first reading unless the gauge zero is
-    known."""
+    """Reading of the nominal machine, [m], if the dial is set in the first posture or the gauge
+    zero is known."""
     path: Array | None = None
     """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
     do not command the tool."""
@@ -289,20 +289,23 @@ def state_path_approaches(session: Session) -> Session:
 
 def dial_zero(gauge: Gauge) -> str:
     """Text of the reading in the middle of a gauge's range, to which its dial is set, in mm."""
-    low, high = gauge.range or (0.0, 0.0)
-    return f"{0.5 * (low + high) / MM + 0.0:g}"
+    return f"{gauge.middle / MM + 0.0:g}"
 
 
-def range_of_expected(session: Session, setup: str) -> tuple[float, float]:
+def range_of_expected(session: Session, setup: str, first: Stop) -> tuple[float, float]:
     """Lowest and highest expected reading within the range of a setup's gauge, [m].
 
-    The first reading is in the middle of the range unless the gauge zero is known.
+    Differences begin at 0, in the middle of the range.
+
+    Args:
+        session: The session.
+        setup: Name of the setup.
+        first: Its first stop that is not the alignment.
     """
-    limits = session.gauges[session.setups[setup].gauge].range or (-np.inf, np.inf)
-    if session.setups[setup].zero == "known":
-        return limits
-    half = 0.5 * (limits[1] - limits[0])
-    return -half, half
+    gauge = session.gauges[session.setups[setup].gauge]
+    if first.role == "subtracted":
+        return -gauge.half_range, gauge.half_range
+    return gauge.range or (-np.inf, np.inf)
 
 
 def set_dial(session: Session, setup: str) -> str:
@@ -312,7 +315,7 @@ def set_dial(session: Session, setup: str) -> str:
         return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
     travel = ""
     if gauge.range is not None:
-        travel = f", about {0.5 * (gauge.range[1] - gauge.range[0]) / MM:g} mm"
+        travel = f", about {gauge.half_range / MM:g} mm"
     return (
         f"Set the gauge so that its plunger is pressed in by half of its travel{travel}. Then turn "
         f"the bezel until the dial shows {dial_zero(gauge)}."
@@ -698,9 +701,11 @@ def _predict(
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
+    low, high = range_of_expected(session, setup, stops[first])
     if session.setups[setup].zero != "known":
         predicted = predicted - predicted[ends[first] - 1]
-    low, high = range_of_expected(session, setup)
+        if stops[first].role == "reading":
+            predicted += session.gauges[session.setups[setup].gauge].middle
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
