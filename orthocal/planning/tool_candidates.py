@@ -14,6 +14,7 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.kinematics.tool_rotation import place_turning
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import possible_approaches
 from orthocal.planning.equipment import choose_box, place_reachable, posture_name
@@ -283,8 +284,9 @@ def _bars(
             around = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
             circles.append(ball + share * length * unit[axis] + radius * around)
         points = np.unique(np.concatenate(circles).round(9), axis=0)
+        inclined = _is_inclined(sensor, (ball - points) @ np.eye(3)[list(coordinates)])
+        points = place_turning(robot, points[inclined], tool)
         inside = ((points >= box[:, 0]) & (points <= box[:, 1])).all(axis=1)
-        inside &= _is_inclined(sensor, (ball - points) @ np.eye(3)[list(coordinates)])
         in_space = np.array(fixed)
         in_space[list(coordinates)] = ball
         keys = {

@@ -14,7 +14,7 @@ import pytest
 from bounds import rms_band
 from calibrated import identified
 from commands import run_orthocal
-from machines import frames
+from machines import frame_pose, frames
 from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
 from uncompared import uncompared
@@ -448,6 +448,32 @@ def test_a_bar_is_as_steep_as_its_file_states(owned, orthoglide):
     sines = np.array([bar[2] / np.linalg.norm(bar) for bar in bars])
     assert -0.25 < sines.max() <= np.sin(np.radians(-10.0))
     assert sines.min() == pytest.approx(-1.0)
+
+
+def test_a_bar_keeps_its_length_at_a_tool_that_turns(owned, root):
+    """The ball is beside the tool centre point of a rod; its positions are Pinocchio's."""
+    robot = load_robot(root / "tests/robots/biglide")
+    sensors = owned(bar=BAR + "tool_mm: [20, 0, -10]\n")
+    with few_balls(1):
+        gauges, postures, setups, readings = list_tool_candidates(robot, sensors, None)
+    (setup,) = setups.values()
+    session = Session(
+        robot=robot,
+        robot_reference=robot.name,
+        gauges=gauges,
+        postures={r.posture: postures[r.posture] for r in readings[::6]},
+        setups=setups,
+        readings=tuple(readings[::6]),
+    )
+    (motion,) = plan_motion(session)
+
+    def deviation(drives):
+        ball = frame_pose(robot, drives, robot.tcp.frame).act(np.array(setup.sensor.tool))
+        return abs(np.linalg.norm(ball - setup.sensor.centre) - setup.sensor.length)
+
+    assert len(session.postures) > 2
+    assert max(deviation(p.drives) for p in session.postures.values()) < SAME_NUMBER
+    assert max(deviation(d) for stop in motion.stops for d in stop.path) < 3.0 * SAGITTA
 
 
 def needed_range(robot, sensors, **options):

@@ -23,6 +23,7 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
+from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
@@ -43,6 +44,7 @@ from orthocal.sensors.protocol import (
     Contact,
     Sensor,
     ToolPath,
+    Triple,
     has_dial,
     instrument,
     reads_pairs,
@@ -345,16 +347,21 @@ def _guided_setups(session: Session) -> dict[str, Path]:
     """Prescribed paths of the tool between readings, by setup, for sensors that have one."""
     if not session.robot.commands_tool:
         return {}
-    paths = {name: tool_path(s.sensor) for name, s in session.setups.items()}
     return {
-        name: _in_coordinates(session.robot, path)
-        for name, path in paths.items()
-        if path is not None
+        name: _in_coordinates(session.robot, path, getattr(setup.sensor, "tool", (0.0, 0.0, 0.0)))
+        for name, setup in session.setups.items()
+        if (path := tool_path(setup.sensor)) is not None
     }
 
 
-def _in_coordinates(robot: Robot, path: ToolPath) -> Path:
-    """Path between coordinates that the drives control: in space, or in the plane of motion."""
+def _in_coordinates(robot: Robot, path: ToolPath, tool: Triple) -> Path:
+    """Path between coordinates that the drives control: in space, or in the plane of motion.
+
+    Args:
+        robot: The robot.
+        path: Path of a tool without rotation.
+        tool: Point of the tool that follows the path, in the tool's frame, [m].
+    """
     coordinates = list(require_tcp(robot).coordinates)
     others = [k for k in range(3) if k not in coordinates]
     normal = [np.eye(3)[others[0]]] if len(others) == 1 else []
@@ -362,8 +369,9 @@ def _in_coordinates(robot: Robot, path: ToolPath) -> Path:
 
     def between(start: Array, end: Array) -> Array:
         ends = np.array([fixed, fixed])
-        ends[:, coordinates] = start, end
-        return np.asarray(path(*ends, *normal)[:, coordinates])
+        on_path = np.array([start, end])
+        ends[:, coordinates] = on_path + rotation_shift(robot, on_path, tool)
+        return place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
 
     return between
 
