@@ -196,22 +196,23 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         raise ParameterError(
             f"'{robot.name}' has no legs for a gauge; add orthocal.legs", where="plan"
         )
+    limited = equipment.limit_travel(robot)
     tool_gauges, tool_postures, tool_setups, tool_readings = list_tool_candidates(
-        robot, equipment.owned, equipment.box
+        limited, equipment.owned, equipment.box
     )
     dial = DIAL if equipment.owned else ""
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     for leg in robot.legs.values():
-        names = _add_postures(robot, leg, equipment, postures)
+        names = _add_postures(limited, leg, equipment, postures)
         for name, sensor in _sensors(leg, equipment):
             setups[name] = Setup(name, sensor, dial)
             readings += [Reading(name, p) for p in names]
             if len(readings) > MAX_CANDIDATES * 10:
                 break
     session = Session(
-        robot=robot,
+        robot=limited,
         robot_reference=reference or robot.name,
         gauges={dial: equipment.gauge},
         postures=postures,
@@ -223,6 +224,7 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         tool_gauges = {**session.gauges, **tool_gauges}
     return replace(
         session,
+        robot=robot,
         gauges=tool_gauges,
         postures={**session.postures, **tool_postures},
         setups={**session.setups, **tool_setups},
@@ -430,7 +432,10 @@ def _add_postures(
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
     placed = place_reachable(robot, points, middle)
     if len(placed) < MIN_READINGS:
-        raise ParameterError("the machine reaches no posture in this box", where="plan: box")
+        within = " and within the soft limits" if equipment.soft_limits else ""
+        raise ParameterError(
+            f"the machine reaches no posture in this box{within}", where="plan: box"
+        )
     for name, posture in placed.items():
         postures.setdefault(name, posture)
     return list(placed)
