@@ -152,6 +152,7 @@ def _choose(
     """
     from orthocal.effects.loading import with_effects
     from orthocal.kinematics.workspace import box_workspace
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
     from orthocal.robot.parameters import errors_at
 
     session, robot = load_robot_or_session(subject)
@@ -161,6 +162,9 @@ def _choose(
     if options.add is not None and options.setups is not None:
         raise ParameterError("found with --setups; expected one", where="--add")
     equipment, compensation = _read_equipment(options, robot, measured), controller.read(robot)
+    if controller.ini is not None:
+        limits = read_controller_joints(controller.ini, robot).limits
+        equipment = replace(equipment, soft_limits=limits)
     workspace = None
     if options.workspace_mm is not None:
         workspace = box_workspace(robot, read_workspace(options.workspace_mm, robot))

@@ -104,7 +104,7 @@ def simulate_session(
         seed: Seed of noise, gauge zeros and nuisance parameters.
         sigma: Standard deviation of a reading, [m]; that of the gauge by default.
         exact: Simulate no noise, no rounding and no drawn mounting errors; the first reading of
-            each setup is then 0.
+            each setup is then in the middle of its gauge's range.
 
     Raises:
         SessionError: If the noise is not stated, a reading does not exist, or it is outside the
@@ -192,7 +192,8 @@ def show_readings(
         entries: Exact readings with gauge zeros at 0, shape (n_entries,), [m].
         rng: Generator of zeros and noise.
         sigma: Standard deviation of a reading, [m]; that of the gauge by default.
-        exact: Add no noise and no rounding; the first reading of each setup is then 0.
+        exact: Add no noise and no rounding; the first reading of each setup is then in the middle
+            of its gauge's range.
 
     Returns:
         Readings of the gauges, shape (n_entries,), [m], and gauge zeros by setup, [m].
@@ -206,12 +207,12 @@ def show_readings(
         silent = [name for name in used if plan.gauges[name].sigma is None]
         plan.refuse_missing(silent, "sigma_mm", ": the noise to simulate is not stated")
     noise = np.array([(g.sigma if sigma is None else sigma) or 0.0 for g in gauges])
-    # the operator sets the dial near 0 in the first posture of a setup
+    # the operator sets the dial near the middle of its range in the first posture of a setup
     zeros = dict.fromkeys(plan.setups, 0.0)
     for i, (name, setup) in enumerate(plan.setups.items()):
         if setup.zero == "known":
             continue
-        zeros[name] = -float(entries[observations.setup == i][:1].sum())
+        zeros[name] = gauges[i].middle - float(entries[observations.setup == i][:1].sum())
         if not exact:
             zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
     entries = entries + np.array(list(zeros.values()))[observations.setup]

@@ -26,7 +26,7 @@ from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_reachable
 from orthocal.planning.expected_error import ENTERED_OFFSET_STD
 from orthocal.planning.owned_sensors import DIAL
-from orthocal.planning.tool_candidates import list_tool_candidates
+from orthocal.planning.tool_candidates import PLACE, list_tool_candidates
 from orthocal.robot.model import Leg, Robot
 from orthocal.robot.parameters import is_offset
 from orthocal.sensors.direction import Direction
@@ -196,22 +196,23 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         raise ParameterError(
             f"'{robot.name}' has no legs for a gauge; add orthocal.legs", where="plan"
         )
+    limited = equipment.limit_travel(robot)
     tool_gauges, tool_postures, tool_setups, tool_readings = list_tool_candidates(
-        robot, equipment.owned, equipment.box
+        limited, equipment.owned, equipment.box
     )
     dial = DIAL if equipment.owned else ""
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     for leg in robot.legs.values():
-        names = _add_postures(robot, leg, equipment, postures)
+        names = _add_postures(limited, leg, equipment, postures)
         for name, sensor in _sensors(leg, equipment):
             setups[name] = Setup(name, sensor, dial)
             readings += [Reading(name, p) for p in names]
             if len(readings) > MAX_CANDIDATES * 10:
                 break
     session = Session(
-        robot=robot,
+        robot=limited,
         robot_reference=reference or robot.name,
         gauges={dial: equipment.gauge},
         postures=postures,
@@ -223,6 +224,7 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         tool_gauges = {**session.gauges, **tool_gauges}
     return replace(
         session,
+        robot=robot,
         gauges=tool_gauges,
         postures={**session.postures, **tool_postures},
         setups={**session.setups, **tool_setups},
@@ -276,11 +278,10 @@ def measure_candidates(
             prior = prior @ prior.T + covariance[of_part, of_part]
             margin = spare_range * ratio * _prior_std(prior, absolute=absolute)
             margins.append(float(margin.max()))
-            limits, predicted = session.gauges[part.gauge].range, ratio * h[rows[of_part]]
-            if limits is not None:
-                middle = 0.5 * sum(limits) if absolute else None
-                span = margin + _distances(predicted, middle)
-                reachable &= span <= 0.5 * (limits[1] - limits[0])
+            gauge, predicted = session.gauges[part.gauge], ratio * h[rows[of_part]]
+            if gauge.range is not None:
+                span = margin + _distances(predicted, gauge.middle if absolute else None)
+                reachable &= span <= gauge.half_range
                 each = np.diag(span) if absolute else span
                 spans.setdefault(base, []).append(float(np.median(each)))
             zero = 0.0 if absolute or width == 1 else ZERO_PRIOR / ratio
@@ -431,7 +432,10 @@ def _add_postures(
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
     placed = place_reachable(robot, points, middle)
     if len(placed) < MIN_READINGS:
-        raise ParameterError("the machine reaches no posture in this box", where="plan: box")
+        within = " and within the soft limits" if equipment.soft_limits else ""
+        raise ParameterError(
+            f"the machine reaches no posture in this box{within}", where="plan: box"
+        )
     for name, posture in placed.items():
         postures.setdefault(name, posture)
     return list(placed)
@@ -445,12 +449,12 @@ def _phases(robot: Robot, count: int) -> Array:
 
 def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator]]:
     """Names and indicators of all possible setups at a leg."""
-    for direction in directions_across(leg):
-        prefix = direction if isinstance(direction, str) else "d"
+    for i, direction in enumerate(directions_across(leg), 1):
+        prefix = direction if isinstance(direction, str) else f"d{i}"
         for fraction in equipment.sections:
             for sensor in equipment.list_sensors(leg, direction, fraction):
-                rod = "" if sensor.rod is None else f"_{sensor.rod}"
-                yield f"{prefix}{leg.name}{rod}_{fraction:g}", sensor
+                rod = "" if sensor.rod is None else f"{sensor.rod}_"
+                yield f"{prefix}{leg.name}{PLACE}{rod}{fraction:g}", sensor
 
 
 def directions_across(leg: Leg) -> list[Direction]:

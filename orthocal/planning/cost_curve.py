@@ -11,7 +11,7 @@ import numpy as np
 
 from orthocal.errors import ParameterError
 from orthocal.planning.expected_error import Criterion, Expected
-from orthocal.planning.timed_search import TimedSearch
+from orthocal.planning.timed_search import MAX_SETUPS, TimedSearch
 
 HOURLY_GAIN = 0.05
 """Smallest relative reduction of the error that justifies another hour."""
@@ -20,8 +20,6 @@ HOUR = 60.0
 
 CURVE_LENGTH = 2.0
 """Number of setups of the curve, relative to the plan."""
-
-MAX_SETUPS = 40
 
 
 @dataclass(frozen=True, slots=True)

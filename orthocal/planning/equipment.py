@@ -20,6 +20,7 @@ from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.session_keys import GaugeKeys
+from orthocal.measurement.motion.approach import approach_steps, usual_approaches
 from orthocal.observation.conditions import (
     MINUTES_PER_READING,
     MINUTES_PER_SETUP,
@@ -94,6 +95,8 @@ class Equipment:
     of the nominal dimensions."""
     owned: tuple[OwnedSensor, ...] = ()
     """Available sensors at the tool."""
+    soft_limits: tuple[tuple[float, float], ...] = ()
+    """Limits of each joint that the controller accepts, [m, rad]; by default the travel."""
 
     def list_sensors(self, leg: Leg, direction: Direction, fraction: float) -> list[LegIndicator]:
         """Indicators at a section of a leg, one for each rod that the tip can touch.
@@ -112,6 +115,22 @@ class Equipment:
                     f"'{rod}' is not a rod of leg {leg.name}; rods: {known}", where="touches"
                 )
         return [line.on_rod(rod, self.tip) for rod in self.rods or tuple(leg.rods)[:1]]
+
+    def limit_travel(self, robot: Robot) -> Robot:
+        """Robot whose travel is within the soft limits.
+
+        If no effect depends on the approach, programs choose its side. The limits then have room
+        for an approach from either side.
+        """
+        if not self.soft_limits:
+            return robot
+        room = approach_steps(robot, "p" * len(robot.drives)) * (not usual_approaches(robot))
+        drives = []
+        for drive, limits, length in zip(robot.drives, self.soft_limits, room, strict=True):
+            low, high = sorted(drive.from_joint(limits).tolist())
+            travel = max(drive.lower, low + length), min(drive.upper, high - length)
+            drives.append(replace(drive, lower=travel[0], upper=travel[1]))
+        return replace(robot, drives=tuple(drives))
 
     def minutes(self, setups: int, readings: int) -> float:
         """Minutes of setups at legs and their readings."""

@@ -19,7 +19,7 @@ from orthocal.planning.equipment import Equipment, choose_box, place_tool, postu
 from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.planning.further_readings import FurtherReadings
 from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
-from orthocal.robot.model import Leg, Robot
+from orthocal.robot.model import Leg, Robot, require_tcp
 from orthocal.sensors.mounting import EXACT
 from orthocal.sensors.tool_indicator import Artefact, ToolIndicator
 from orthocal.session.session import Conditions, Gauge, Reading, Session, Setup
@@ -243,7 +243,7 @@ def _read_legs(
     points, setups, readings = {"zero": middle}, {}, []
     for leg in robot.legs.values():
         name, along = _axis_of(leg)
-        along = along[: len(middle)]
+        along = along[list(require_tcp(robot).coordinates)]
         with np.errstate(divide="ignore"):
             limits = np.sort(box / along[:, None], axis=1)
         least, largest = float(np.nanmax(limits[:, 0])), float(np.nanmin(limits[:, 1]))

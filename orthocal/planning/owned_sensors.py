@@ -38,9 +38,11 @@ class Duration(NamedTuple):
     def max_readings(self, minutes: float, limit: int) -> int:
         """Largest number of readings of a setup within a time, without the closing one."""
         available = minutes - self.setup + SLACK
+        if available < 0.0:
+            return 0
         if available < self.reading * (limit + 1):
             return max(int(available / self.reading) - 1, 0)
-        return limit if available > 0.0 else 0
+        return limit
 
 
 DURATIONS = {

@@ -28,7 +28,6 @@ from orthocal.planning.candidates import (
 )
 from orthocal.planning.cost_curve import (
     HOUR,
-    MAX_SETUPS,
     Stage,
     compute_curve,
     find_enough,
@@ -44,12 +43,13 @@ from orthocal.planning.expected_error import (
     state_noise,
 )
 from orthocal.planning.further_readings import FurtherReadings, find_further_readings
+from orthocal.planning.owned_sensors import SLACK
 from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.planned_session import build_session
 from orthocal.planning.ranking import best_of, is_less
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
-from orthocal.planning.timed_search import TimedSearch
+from orthocal.planning.timed_search import MAX_SETUPS, TimedSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.sensors.leg_indicator import LegIndicator
@@ -207,11 +207,7 @@ def plan_readings(
     chosen = resolve_choice(choice, measured, default_model=MODEL)
     robot, measured = _with_choice(robot, measured, chosen)
     equipment = equipment or Equipment()
-    counts = _list_counts(setups, readings, hours, equipment, robot)
-    counts_or_minutes: Sequence[list[int]] | float = counts
-    if equipment.owned and setups is None and readings is None:
-        total = equipment.minutes(len(counts[0]), sum(counts[0]) + len(counts[0]))
-        counts_or_minutes = total if hours is None else HOUR * hours
+    counts_or_minutes = _counts_or_minutes(setups, readings, hours, equipment, robot)
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
     session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
@@ -288,7 +284,10 @@ def _plan(
         return plan
     options.report("searching from a usual plan, because it is better")
     error, setups = better
-    improved = search.improve(setups)
+    if isinstance(counts_or_minutes, float):
+        improved = timed.improve(setups, counts_or_minutes)
+    else:
+        improved = search.improve(setups)
     expected = compare(improved).expect_plan()
     best = (
         improved if is_less(expected.rms_by(options.criterion), error) else search.plan_of(setups)
@@ -362,10 +361,8 @@ def _find_unchosen(comparison: Comparison) -> dict[str, float]:
     for owned in comparison.equipment.owned:
         if owned.name in planned or owned.name in candidates.unusable:
             continue
-        limits = candidates.session.gauges[owned.name].range
         needed = candidates.needed.get(owned.name, 0.0)
-        beyond = limits is not None and needed > 0.5 * (limits[1] - limits[0])
-        unchosen[owned.name] = needed if beyond else 0.0
+        unchosen[owned.name] = needed if needed > owned.gauge.half_range else 0.0
     return unchosen
 
 
@@ -469,26 +466,34 @@ def _evaluate(
     )
 
 
-def _list_counts(
+def _counts_or_minutes(
     setups: int | None,
     readings: int | None,
     hours: float | None,
     equipment: Equipment,
     robot: Robot,
-) -> list[list[int]]:
-    """Possible lists of the numbers of readings of each setup; arguments as in `plan_readings`."""
+) -> Sequence[list[int]] | float:
+    """Possible lists of the numbers of readings of each setup, or the available time, [min].
+
+    Setups of several sensors share a time unless their number is stated. The arguments are those of
+    `plan_readings`.
+    """
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError(
                 "found together with setups or readings; state hours, or setups and readings",
                 where="hours",
             )
-        options = []
-        for each in READINGS_PER_SETUP:
-            count = int(hours * HOUR / equipment.minutes(1, each + 1))
-            if 1 <= count <= MAX_SETUPS:
-                options.append([each] * count)
-        if not options and not equipment.owned:
+        if not 0.0 < hours < math.inf:
+            raise ParameterError(f"found {hours:g}; expected a positive number", where="hours")
+        if equipment.owned:
+            return HOUR * hours
+        counts = {
+            each: int(hours * HOUR / max(equipment.minutes(1, each + 1), SLACK))
+            for each in READINGS_PER_SETUP
+        }
+        options = [[each] * count for each, count in counts.items() if 1 <= count <= MAX_SETUPS]
+        if not options:
             min_hours = equipment.minutes(1, READINGS_PER_SETUP[0] + 1) / HOUR
             raise ParameterError(
                 f"found {hours:g}; expected at least {min_hours:.2g}, a setup of "
@@ -507,6 +512,8 @@ def _list_counts(
             f"{count} setups: a single reading only determines the gauge zero",
             where="readings",
         )
+    if equipment.owned and setups is None and readings is None:
+        return float(equipment.minutes(count, total + count))
     return [[total // count + (i < total % count) for i in range(count)]]
 
 

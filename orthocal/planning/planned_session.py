@@ -14,6 +14,7 @@ from orthocal.errors import UnreachablePathError
 from orthocal.measurement.motion.motion import state_path_approaches
 from orthocal.planning.candidates import Candidates
 from orthocal.planning.selection import PlannedSetup
+from orthocal.planning.tool_candidates import PLACE
 from orthocal.session.points import base_name, names_in_files
 from orthocal.session.session import Posture, Reading, Session, Setup
 
@@ -123,7 +124,10 @@ def _order_readings(
     if measured is None:
         return state_path_approaches(plan)
     plan = replace(
-        plan, compensation=measured.compensation, controller_origin=measured.controller_origin
+        plan,
+        compensation=measured.compensation,
+        controller_origin=measured.controller_origin,
+        adjusted=measured.adjusted,
     )
     if measured.controller_offsets is not None:
         plan = plan.with_controller(measured.controller_offsets)
@@ -161,8 +165,8 @@ def order_postures(points: Array) -> list[int]:
 
 
 def _setup_name(candidate: str, used_names: set[str]) -> str:
-    """Short name of a setup: direction and leg, with a number where there are several."""
-    short = candidate.partition("_")[0]
+    """Name of a setup without its place, with a number where there are several."""
+    short = candidate.rpartition(PLACE)[0] or candidate
     if short not in used_names:
         return short
     return next(

@@ -35,6 +35,9 @@ from orthocal.runtime.worker_pool import run_in_parallel
 READINGS = (2, 3, 4, 6, 9, 12, 16, 24, 32, 48, 64, 96)
 """Possible numbers of readings of a setup."""
 
+MAX_SETUPS = 40
+"""Most setups of a plan."""
+
 MAX_ROUNDS = 4
 """Most rounds of exchanges."""
 
@@ -138,20 +141,25 @@ class TimedSearch:
             minutes: Available time.
             first: Gauge of the first setup; None for the setup of largest gain per minute.
         """
-        with threadpool_limits(1):  # on several threads sums may be rounded differently
-            plan = self.search.empty
-            if first is not None:
-                options = self._list_options(plan, 0.5 * minutes)
-                of_gauge = [o for o in options if self._gauge(o.planned) == first]
-                if of_gauge:
-                    best = best_of(of_gauge, lambda o: o.gain)
-                    plan = self.search.plan_of([best.planned])
-            plan = self._improve(self.fill(plan, minutes), minutes, together=1)
+        setups = []
+        if first is not None:
+            with threadpool_limits(1):  # on several threads sums may be rounded differently
+                options = self._list_options(self.search.empty, 0.5 * minutes)
+            of_gauge = [o for o in options if self._gauge(o.planned) == first]
+            if of_gauge:
+                setups.append(best_of(of_gauge, lambda o: o.gain).planned)
+        return self.improve(setups, minutes)
+
+    def improve(self, setups: Sequence[PlannedSetup], minutes: float) -> PlannedSetups:
+        """Plan with these setups and further ones, exchanged for better ones within a time."""
+        with threadpool_limits(1):
+            plan = self.fill(self.search.plan_of(setups), minutes)
+            plan = self._exchange_all(plan, minutes, together=1)
             if len(plan.setups) > MAX_PAIRED_SETUPS:
                 return plan
-            return self._improve(plan, minutes, together=2)
+            return self._exchange_all(plan, minutes, together=2)
 
-    def _improve(self, plan: PlannedSetups, minutes: float, *, together: int) -> PlannedSetups:
+    def _exchange_all(self, plan: PlannedSetups, minutes: float, *, together: int) -> PlannedSetups:
         """Exchange setups, one or two at a time, until the gain is small."""
         unimproved: set[tuple[PlannedSetup, ...]] = set()  # no better setups were found for these
         for _ in range(MAX_ROUNDS):
@@ -168,11 +176,11 @@ class TimedSearch:
 
     def fill(self, plan: PlannedSetups, minutes: float) -> PlannedSetups:
         """Add setups of largest gain per minute to a plan until none fits into a time."""
-        while True:
-            options = self._list_options(plan, minutes - self.minutes(plan.setups))
-            if not options:
-                return plan
+        while len(plan.setups) < MAX_SETUPS and (
+            options := self._list_options(plan, minutes - self.minutes(plan.setups))
+        ):
             plan = self.search.extend(plan, best_of(options, _rate).planned)
+        return plan
 
     def grow(self) -> Iterator[PlannedSetups]:
         """Add setups one by one, or readings to a setup that can be used once.

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.kinematics.tool_rotation import place_turning
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import possible_approaches
 from orthocal.planning.equipment import choose_box, place_reachable, posture_name
@@ -64,6 +66,9 @@ SAME_ANGLE = 1e-6
 
 STEP = 5 * MM
 """Step of the positions, [m]."""
+
+PLACE = "@"
+"""Mark before the place of a sensor in the name of a candidate setup."""
 
 
 def list_tool_candidates(
@@ -237,7 +242,10 @@ def segment_distances(start: Array, end: Array, other_start: Array, other_end: A
 def _places(
     sensor: OwnedSensor, robot: Robot, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement."""
+    """Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement.
+
+    Positions are within the box, except for the height of a bed.
+    """
     if sensor.keys["sensor"] == "ball_bar":
         return _bars(sensor, robot, box)
     places = {
@@ -249,7 +257,7 @@ def _places(
         "gauge_block": _blocks,
     }
     kind = sensor.keys.get("artefact", {}).get("kind", sensor.keys["sensor"])
-    return places[kind](sensor, middle, box)
+    return places[kind](sensor, np.clip(middle, *box.T), box)
 
 
 def _bars(
@@ -276,15 +284,16 @@ def _bars(
             around = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
             circles.append(ball + share * length * unit[axis] + radius * around)
         points = np.unique(np.concatenate(circles).round(9), axis=0)
+        inclined = _is_inclined(sensor, (ball - points) @ np.eye(3)[list(coordinates)])
+        points = place_turning(robot, points[inclined], tool)
         inside = ((points >= box[:, 0]) & (points <= box[:, 1])).all(axis=1)
-        inside &= _is_inclined(sensor, (ball - points) @ np.eye(3)[list(coordinates)])
         in_space = np.array(fixed)
         in_space[list(coordinates)] = ball
         keys = {
             "centre_mm": ((in_space + tool) / MM).round(6).tolist(),
             "ball": f"{sensor.name}_ball_{k + 1}",
         }
-        yield f"{sensor.name}_{k}", keys, points[inside]
+        yield f"{sensor.name}{PLACE}{k}", keys, points[inside]
 
 
 def _is_inclined(sensor: OwnedSensor, bars: Array) -> Mask:
@@ -315,9 +324,7 @@ def _points(
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
     """Positions of a target in a box."""
     del middle
-    lines = [
-        np.round(np.linspace(low, high, LINE_POINTS) / STEP) * STEP for low, high in box.tolist()
-    ]
+    lines = [_round(np.linspace(low, high, LINE_POINTS), low, high) for low, high in box.tolist()]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
     yield sensor.name, {}, points
 
@@ -340,7 +347,7 @@ def _edges(
                 "direction": "xyz"[direction],
                 "artefact": {**artefact, "along": "xyz"[along], "name": name},
             }
-            yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}_{k}", keys, points
+            yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}{PLACE}{k}", keys, points
 
 
 def _plates(
@@ -352,17 +359,17 @@ def _plates(
         for k, level in enumerate(LEVELS):
             points = _grid(middle, box, axis, length, PLATE_POINTS)
             points[:, axis] = _at_level(middle, box, axis, level)[axis]
-            yield f"{sensor.name}{'xyz'[axis]}_{k}", {"direction": f"-{'xyz'[axis]}"}, points
+            yield f"{sensor.name}{'xyz'[axis]}{PLACE}{k}", {"direction": f"-{'xyz'[axis]}"}, points
 
 
 def _blocks(
     sensor: OwnedSensor, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Positions beside a gauge block and on it, along each axis."""
+    """Positions beside a gauge block and on it, along each axis in which it fits into the box."""
     artefact = dict(sensor.keys["artefact"])
     height = float(artefact.get("height_mm", 0.0)) * MM
-    for axis in range(3):
-        low = np.round((middle[axis] - 0.5 * height) / STEP) * STEP
+    for axis in np.flatnonzero(np.ptp(box, axis=1) >= height).tolist():
+        low = _round(middle[axis] - 0.5 * height, box[axis, 0], box[axis, 1] - height)
         points = np.repeat(_grid(middle, box, axis, 60 * MM, 3), 2, axis=0)
         points[0::2, axis], points[1::2, axis] = low, low + height
         keys = {
@@ -373,18 +380,23 @@ def _blocks(
 
 
 def _at_level(middle: Array, box: Array, axis: int, level: float) -> Array:
-    """Mechanical zero displaced along an axis to a level of the box, shape (3,), [m]."""
+    """Position displaced along an axis to a level of the box, shape (3,), [m]."""
     place = np.array(middle)
     half = 0.5 * (box[axis, 1] - box[axis, 0])
-    place[axis] = np.round((box[axis].mean() + level * half) / STEP) * STEP
+    place[axis] = _round(box[axis].mean() + level * half, *box[axis])
     return place
 
 
 def _line(middle: Array, box: Array, axis: int, length: float, count: int = EDGE_POINTS) -> Array:
-    """Coordinates along an axis on an artefact about the mechanical zero, shape (n,), [m]."""
+    """Coordinates along an axis on an artefact about a position, shape (n,), [m]."""
     low = max(float(box[axis, 0]), float(middle[axis]) - 0.5 * length)
     high = min(float(box[axis, 1]), float(middle[axis]) + 0.5 * length)
-    return np.unique(np.round(np.linspace(low, high, count) / STEP) * STEP)
+    return np.unique(_round(np.linspace(low, high, count), low, high))
+
+
+def _round(positions: ArrayLike, low: float, high: float) -> Array:
+    """Positions rounded to STEP, but within limits, [m]."""
+    return np.clip(np.round(np.asarray(positions) / STEP) * STEP, low, high)
 
 
 def _grid(middle: Array, box: Array, axis: int, length: float, count: int) -> Array:

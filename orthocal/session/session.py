@@ -79,6 +79,16 @@ class Gauge:
                 f"range: found {self.range!r}; expected the lowest and the highest reading, in m"
             )
 
+    @property
+    def middle(self) -> float:
+        """Reading in the middle of the range, to which the operator sets the dial, [m]."""
+        return 0.0 if self.range is None else 0.5 * sum(self.range)
+
+    @property
+    def half_range(self) -> float:
+        """Range to either side of the middle, [m]; infinite if it is not stated."""
+        return math.inf if self.range is None else 0.5 * (self.range[1] - self.range[0])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posture:

@@ -12,10 +12,12 @@ from tolerances import KINEMATICS
 from orthocal import draw_errors, load_plan, load_session, simulate_session, write_session
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import build_problem
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import collect_errors, load_errors, truth_document
+from orthocal.output.sheet.page import sheet_files
 
 ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -196,6 +198,19 @@ def test_a_gauge_keeps_its_errors_between_sessions(plan, tmp_path):
 def test_readings_beyond_the_gauge_are_refused(plan):
     with pytest.raises(SessionError, match=r"the simulated reading .* the gauge's range ends at"):
         simulate_session(plan, {"x_slide.offset": 25e-3, "y_slide.offset": -25e-3})
+
+
+def test_a_dial_is_set_to_the_middle_of_its_range(plan):
+    """A dial of 0 to 10 mm is set to 5 mm, as the sheet says; ±5 mm remain to either side."""
+    dials = [replace(plan.gauge, range=limits) for limits in ((-5e-3, 5e-3), (0.0, 10e-3))]
+    plans = [plan.with_gauge(dial) for dial in dials]
+    symmetric, shifted = (simulate_session(p, {}, exact=True).session.values for p in plans)
+    assert shifted == pytest.approx(symmetric + 5e-3, abs=KINEMATICS)
+    stops = [[s for motion in plan_motion(p) for s in motion.stops] for p in plans]
+    for symmetric_stop, stop in zip(*stops, strict=True):
+        assert stop.expected == pytest.approx(symmetric_stop.expected + 5e-3, abs=KINEMATICS)
+        assert stop.lift == symmetric_stop.lift
+    assert "the hand must return to 5 within" in sheet_files(plans[1])["sheet.html"]
 
 
 def test_no_errors_are_an_error(orthoglide):

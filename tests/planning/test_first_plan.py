@@ -135,3 +135,23 @@ def test_the_legs_of_an_inclined_machine_are_read_along_them(tmp_path):
     sheet = sheet_files(plan)["sheet.html"]
     assert "a little outwards" in sheet
     assert "by eye, once: each leg parallel to its axis" in sheet
+
+
+def test_a_tool_that_moves_in_x_and_z_is_moved_along_both(tmp_path, root):
+    """The plane of the biglide, turned about its x axis."""
+    turned = (
+        ('xyz="0 0 1"', 'xyz="0 -1 0"'),
+        ("0 0 1.5707963267948966", "0 -1.5707963267948966 0"),
+        ("rows: [x, y]", "rows: [x, z]"),
+        ("coordinates: [x, y]", "coordinates: [x, z]"),
+    )
+    folder = tmp_path / "biglide"
+    folder.mkdir()
+    for file in (root / "tests/robots/biglide").iterdir():
+        text = file.read_text()
+        for old, new in turned:
+            text = text.replace(old, new)
+        (folder / file.name).write_text(text)
+    plan = paper_plan(load_robot(folder), Equipment())
+    assert plan.postures["z_max"].values == pytest.approx([0.0, 0.06])
+    assert plan.postures["x_min"].values == pytest.approx([-0.08, 0.0])

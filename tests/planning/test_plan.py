@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from adjusting import shimmed_plan
 from bounds import rms_band
 from calibrated import identified
 from models import JOINTS
@@ -20,6 +22,7 @@ from orthocal import (
     Choice,
     draw_errors,
     load_plan,
+    load_robot,
     load_session,
     simulate_session,
     summarize,
@@ -245,6 +248,38 @@ def test_further_setups_combine_with_the_measured_session(orthoglide, root):
     assert set(plan.session.setups).isdisjoint(measured.setups)
 
 
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_further_setups_have_the_adjustments_of_the_measured_session(tmp_path):
+    planned = shimmed_plan(tmp_path / "mine")
+    amounts = {next(iter(planned.robot.declared.adjustments)): 0.5e-3}
+    measured = replace(simulate_session(planned, {}).session, adjusted=amounts)
+    with uncompared():
+        plan = plan_readings(
+            planned.robot, setups=1, measured=measured, equipment=Equipment(**FEW), starts=1
+        )
+    assert plan.session.adjusted == amounts
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "inclined_orthoglide", "linear_delta"])
+def test_each_leg_is_read_in_two_directions(name):
+    """Each candidate is listed once, also at legs that no axis of the world is perpendicular to."""
+    robot = load_robot(name)
+    session = list_candidates(robot, Equipment(**FEW))
+    assert len({r.key for r in session.readings}) == len(session.readings)
+    sensors = [session.setups[n].sensor for n in {r.setup for r in session.readings}]
+    assert len({(s.leg, s.direction) for s in sensors}) == 2 * len(robot.legs)
+
+
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_setups_are_named_after_their_legs(orthoglide):
+    """Also if the names of the legs end in numbers."""
+    legs = {f"leg_{i}": leg for i, leg in enumerate(orthoglide.legs.values(), 1)}
+    legs = {name: replace(leg, name=name) for name, leg in legs.items()}
+    with uncompared():
+        plan = plan_readings(replace(orthoglide, legs=legs), equipment=Equipment(**FEW), starts=1)
+    assert {s.name[1:] == s.sensor.leg for s in plan.session.setups.values()} == {True}
+
+
 def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
     """Drives move from 120 to 390 mm and are at 310 mm in the mechanical zero: -190 to 79 mm, less
     a margin."""
@@ -269,6 +304,11 @@ def test_a_plan_uses_the_available_hours(orthoglide):
         ({"setups": 3, "readings": 5}, "readings: found 5; expected at least 6, 2 for each of 3"),
         ({"setups": 41}, "setups: found 41; expected 1 to 40"),
         ({"hours": 0.1}, "hours: found 0.1; expected at least 0.2"),
+        ({"hours": math.nan}, "hours: found nan; expected a positive number"),
+        (
+            {"hours": 1.0, "equipment": Equipment(minutes_per_setup=0, minutes_per_reading=0)},
+            "hours: found 1; expected .* at most 40 setups",
+        ),
         ({"hours": 1.0, "setups": 3}, "hours: found together with setups or readings"),
         (
             {"readings": 600, "setups": 2, "equipment": Equipment(**QUICK)},

@@ -24,6 +24,7 @@ from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.observation.conditions import MORNING, schedule_readings
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import predict_readings
+from orthocal.output.sheet.soft_limits import describe_beyond_limits
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.first_plan import first_equipment, paper_plan
@@ -122,6 +123,24 @@ def test_candidates_begin_their_approach_within_the_travel(machine):
         names = [n for n, of_posture in approaches.items() if approach in of_posture]
         at = np.array([session.postures[n].drives for n in names])
         assert can_approach(session.robot, at, approach).all()
+    limits = tuple(d.joint_limits for d in drives)
+    within = list_candidates(machine, replace(equipment, soft_limits=limits))
+    assert [r.key for r in within.readings] == [r.key for r in session.readings]
+    assert within.robot is machine
+
+
+@pytest.mark.parametrize("effects", [[], ["backlash"]])
+def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
+    """The travel is 120 to 390 mm, and 310 mm in the mechanical zero."""
+    robot = with_effects(orthoglide, effects)
+    limits = ((0.262, 0.353),) * 3
+    with uncompared():
+        plans = [
+            plan_readings(robot, setups=2, equipment=replace(FEW, soft_limits=soft), starts=1)
+            for soft in ((), limits)
+        ]
+    assert "MAX_LIMIT" in describe_beyond_limits(plans[0].session, limits, file="machine.ini")
+    assert describe_beyond_limits(plans[1].session, limits, file="machine.ini") == ""
 
 
 def test_positions_lie_at_fractions_of_the_lead(orthoglide):

@@ -11,7 +11,7 @@ from test_setup_search import STATE, draw_candidates, information, list_setups, 
 
 from orthocal.errors import ParameterError
 from orthocal.planning.owned_sensors import Duration
-from orthocal.planning.timed_search import TimedSearch
+from orthocal.planning.timed_search import MAX_SETUPS, TimedSearch
 
 DURATIONS = {"slow": Duration(10.0, 0.5), "quick": Duration(4.0, 1.0)}
 MINUTES = 26.0
@@ -70,4 +70,10 @@ def test_durations_of_a_gauge():
     duration = Duration(10.0, 0.5)
     assert duration.of(3) == 12.0
     assert [duration.max_readings(m, 48) for m in (9.0, 10.0, 11.5, 12.0, 1e6)] == [0, 0, 2, 3, 48]
-    assert Duration(10.0, 0.0).max_readings(10.0, 48) == 48
+    assert [Duration(10.0, 0.0).max_readings(m, 48) for m in (9.0, 10.0)] == [0, 48]
+
+
+def test_setups_that_take_no_time_are_limited():
+    *_, timed = draw_timed(0, 0)
+    instant = replace(timed, durations=dict.fromkeys(DURATIONS, Duration(0.0, 0.0)))
+    assert len(instant.fill(instant.search.empty, 1.0).setups) == MAX_SETUPS

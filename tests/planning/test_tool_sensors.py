@@ -14,7 +14,7 @@ import pytest
 from bounds import rms_band
 from calibrated import identified
 from commands import run_orthocal
-from machines import frames
+from machines import frame_pose, frames
 from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
 from uncompared import uncompared
@@ -41,6 +41,7 @@ from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
 from orthocal.output.text.plan import describe_absent, plan_json
+from orthocal.planning import plan as planning
 from orthocal.planning import planned_session, tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, equipment_of, place_tool
@@ -52,6 +53,7 @@ from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.planning.tool_candidates import list_tool_candidates, segment_distances
 from orthocal.sensors.ball_bar import SAGITTA, BallBar
 from orthocal.sensors.registry import read_setup
+from orthocal.session.points import names_in_files
 from orthocal.session.session import Gauge, Reading, Session, Setup
 
 BAR = """sensor: ball_bar
@@ -105,6 +107,36 @@ def planned(owned):
     equipment = Equipment(owned=sensors, **FEW)
     with few_balls(7), uncompared():
         return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
+
+
+def test_a_plan_from_a_better_usual_plan_takes_the_stated_time(owned, monkeypatch):
+    """A precise bar that takes 55 minutes would replace each setup of the usual plan."""
+    bar = "sensor: ball_bar\nlength_mm: 80\nsigma_mm: 0.0005\nminutes_per_setup: 55\n"
+    equipment = Equipment(owned=owned(bar=bar + "centre_tolerance_mm: 0.001\n"), **FEW)
+
+    def search_badly(timed, candidates, *_):
+        which = next(i for i, s in enumerate(candidates.setups) if s.gauge == "dial")
+        return timed.search.plan_of([PlannedSetup(which, (0, 1))] * 5)
+
+    monkeypatch.setattr(planning, "_search_setups", search_badly)
+    with few_balls(2):
+        plan = plan_readings(entered("orthoglide"), hours=1.0, equipment=equipment, starts=1)
+    assert plan.usual_plans
+    assert plan.minutes <= 60.0 + 1e-9
+
+
+def test_sensors_share_the_time_of_six_setups(owned, orthoglide):
+    """In whole minutes, too."""
+    equipment = Equipment(owned=owned(bar=BAR), minutes_per_setup=10, minutes_per_reading=1)
+    minutes = planning._counts_or_minutes(None, None, None, equipment, orthoglide)
+    assert isinstance(minutes, float)
+    assert minutes == 6 * (10 + 4)
+
+
+def test_a_time_too_short_for_any_setup_is_refused(owned, orthoglide):
+    equipment = Equipment(owned=owned(bar=BAR), **FEW)
+    with few_balls(1), pytest.raises(ParameterError, match="found 3 min; expected at least"):
+        plan_readings(orthoglide, hours=0.05, equipment=equipment)
 
 
 def test_a_plan_beside_other_sensors_has_the_dial_of_the_legs(orthoglide):
@@ -297,6 +329,22 @@ def test_a_plan_for_a_printer_is_measured_and_calibrated(for_printer):
     assert tool_rms(forecast, remaining) < 2.0 * for_printer.expected.reported.rms
 
 
+BESIDE_ZERO = np.array([[0.0226, 0.0726], [-0.0426, 0.0526], [-0.0826, -0.0226]])
+
+
+@pytest.mark.parametrize(("name", "box"), [("linear_delta", None), ("orthoglide", BESIDE_ZERO)])
+def test_the_tool_stays_in_the_box(owned, name, box):
+    """The workspace of the delta begins at its bed. The mechanical zero is beside the other box."""
+    robot = load_robot(name)
+    sensors = owned(bar=BAR, square=SQUARE, plate=PLATE, block=BLOCK, track=TRACKER)
+    with few_balls(2):
+        _, postures, setups, _ = list_tool_candidates(robot, sensors, box)
+    assert {names_in_files(s)[1] for s in setups.values()} == {s.name for s in sensors}
+    points = np.array([p.values for p in postures.values()])
+    low, high = (robot.workspace if box is None else box).T
+    assert ((points >= low - 1e-9) & (points <= high + 1e-9)).all()
+
+
 def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
     sensors = owned(probe=PROBE + "tool_mm: [0, 0, -20]\n")
     _, postures, setups, readings = list_tool_candidates(load_robot("linear_delta"), sensors, None)
@@ -378,11 +426,11 @@ def test_no_rod_is_in_the_way_of_a_bar(owned, orthoglide, radius, clear):
     """Rods by Pinocchio. Without room for the bar itself, its axis passes them by 1 mm."""
     sensors = owned(bar=BAR + f"radius_mm: {radius}\n")
     _, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
-    read = [r for r in readings if r.setup == "bar_10"]
+    read = [r for r in readings if r.setup == "bar@10"]
     gaps = []
     for posture in (postures[r.posture] for r in read[::5]):
         found = frames(orthoglide, posture.drives)
-        bar = on_segments(found["tcp"][None], np.array([setups["bar_10"].sensor.centre]))
+        bar = on_segments(found["tcp"][None], np.array([setups["bar@10"].sensor.centre]))
         for rod in orthoglide.rods.values():
             ends = on_segments(found[rod.root][None], found[rod.tip][None])
             gaps.append(nearest(bar, ends)[0] - rod.radius)
@@ -400,6 +448,32 @@ def test_a_bar_is_as_steep_as_its_file_states(owned, orthoglide):
     sines = np.array([bar[2] / np.linalg.norm(bar) for bar in bars])
     assert -0.25 < sines.max() <= np.sin(np.radians(-10.0))
     assert sines.min() == pytest.approx(-1.0)
+
+
+def test_a_bar_keeps_its_length_at_a_tool_that_turns(owned, root):
+    """The ball is beside the tool centre point of a rod; its positions are Pinocchio's."""
+    robot = load_robot(root / "tests/robots/biglide")
+    sensors = owned(bar=BAR + "tool_mm: [20, 0, -10]\n")
+    with few_balls(1):
+        gauges, postures, setups, readings = list_tool_candidates(robot, sensors, None)
+    (setup,) = setups.values()
+    session = Session(
+        robot=robot,
+        robot_reference=robot.name,
+        gauges=gauges,
+        postures={r.posture: postures[r.posture] for r in readings[::6]},
+        setups=setups,
+        readings=tuple(readings[::6]),
+    )
+    (motion,) = plan_motion(session)
+
+    def deviation(drives):
+        ball = frame_pose(robot, drives, robot.tcp.frame).act(np.array(setup.sensor.tool))
+        return abs(np.linalg.norm(ball - setup.sensor.centre) - setup.sensor.length)
+
+    assert len(session.postures) > 2
+    assert max(deviation(p.drives) for p in session.postures.values()) < SAME_NUMBER
+    assert max(deviation(d) for stop in motion.stops for d in stop.path) < 3.0 * SAGITTA
 
 
 def needed_range(robot, sensors, **options):
@@ -668,7 +742,7 @@ def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
     session = list_candidates(
         entered("orthoglide"), Equipment(owned=owned(track=TRACKER + CORRELATED), **QUICK)
     )
-    dial = next(r for r in session.readings if r.setup == "yx_a_0.5")
+    dial = next(r for r in session.readings if r.setup == "yx@a_0.5")
     of_point = [r for r in session.readings if r.setup.startswith("track")][:12]
     few = replace(session, robot_reference="orthoglide").select([dial, *of_point])
     write_session(few, tmp_path / "few", blank=True)

@@ -91,7 +91,8 @@ def test_machines_of_one_kind_share_all_functions(tmp_path, monkeypatch, one, ot
         ToolSensitivity(robot, free=robot.parameters.names)(robot.drive_zero)
         equipment = Equipment(along=2, across=0.0, sections=(0.5,))
         listed = list_candidates(robot, first_equipment(robot, equipment))
-        problem = build_problem(listed.select(listed.readings[:4]), model="full")
+        of_legs = {listed.setups[r.setup].sensor.leg: r for r in listed.readings}
+        problem = build_problem(listed.select(list(of_legs.values())), model="full")
         readings, _ = problem.predict_and_jacobian(np.zeros(problem.n_free))
         assert np.isfinite(readings).all()
         return {p.name for p in (tmp_path / "cache").iterdir()}

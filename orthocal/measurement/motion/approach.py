@@ -66,8 +66,7 @@ def approach_share(session: Session) -> float:
     The length is at most half the range of the gauges, so that the tip stays in contact. It is
     never too short to take up the backlash of a drive.
     """
-    ranges = [g.range for g in session.gauges.values() if g.range is not None]
-    half_range = min((0.5 * (high - low) for low, high in ranges), default=USUAL_LENGTH)
+    half_range = min((USUAL_LENGTH, *(g.half_range for g in session.gauges.values())))
     usual = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE}
     least = max(
         (

@@ -23,6 +23,7 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
+from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
@@ -43,6 +44,7 @@ from orthocal.sensors.protocol import (
     Contact,
     Sensor,
     ToolPath,
+    Triple,
     has_dial,
     instrument,
     reads_pairs,
@@ -140,8 +142,8 @@ class Stop:
     lift: str = ""
     """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
     expected: float = 0.0
-    """Reading of the nominal machine, [m]; relative to the first reading unless the gauge zero is
-    known."""
+    """Reading of the nominal machine, [m], if the dial is set in the first posture or the gauge
+    zero is known."""
     path: Array | None = None
     """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
     do not command the tool."""
@@ -289,20 +291,23 @@ def state_path_approaches(session: Session) -> Session:
 
 def dial_zero(gauge: Gauge) -> str:
     """Text of the reading in the middle of a gauge's range, to which its dial is set, in mm."""
-    low, high = gauge.range or (0.0, 0.0)
-    return f"{0.5 * (low + high) / MM + 0.0:g}"
+    return f"{gauge.middle / MM + 0.0:g}"
 
 
-def range_of_expected(session: Session, setup: str) -> tuple[float, float]:
+def range_of_expected(session: Session, setup: str, first: Stop) -> tuple[float, float]:
     """Lowest and highest expected reading within the range of a setup's gauge, [m].
 
-    The first reading is in the middle of the range unless the gauge zero is known.
+    Differences begin at 0, in the middle of the range.
+
+    Args:
+        session: The session.
+        setup: Name of the setup.
+        first: Its first stop that is not the alignment.
     """
-    limits = session.gauges[session.setups[setup].gauge].range or (-np.inf, np.inf)
-    if session.setups[setup].zero == "known":
-        return limits
-    half = 0.5 * (limits[1] - limits[0])
-    return -half, half
+    gauge = session.gauges[session.setups[setup].gauge]
+    if first.role == "subtracted":
+        return -gauge.half_range, gauge.half_range
+    return gauge.range or (-np.inf, np.inf)
 
 
 def set_dial(session: Session, setup: str) -> str:
@@ -312,7 +317,7 @@ def set_dial(session: Session, setup: str) -> str:
         return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
     travel = ""
     if gauge.range is not None:
-        travel = f", about {0.5 * (gauge.range[1] - gauge.range[0]) / MM:g} mm"
+        travel = f", about {gauge.half_range / MM:g} mm"
     return (
         f"Set the gauge so that its plunger is pressed in by half of its travel{travel}. Then turn "
         f"the bezel until the dial shows {dial_zero(gauge)}."
@@ -342,16 +347,21 @@ def _guided_setups(session: Session) -> dict[str, Path]:
     """Prescribed paths of the tool between readings, by setup, for sensors that have one."""
     if not session.robot.commands_tool:
         return {}
-    paths = {name: tool_path(s.sensor) for name, s in session.setups.items()}
     return {
-        name: _in_coordinates(session.robot, path)
-        for name, path in paths.items()
-        if path is not None
+        name: _in_coordinates(session.robot, path, getattr(setup.sensor, "tool", (0.0, 0.0, 0.0)))
+        for name, setup in session.setups.items()
+        if (path := tool_path(setup.sensor)) is not None
     }
 
 
-def _in_coordinates(robot: Robot, path: ToolPath) -> Path:
-    """Path between coordinates that the drives control: in space, or in the plane of motion."""
+def _in_coordinates(robot: Robot, path: ToolPath, tool: Triple) -> Path:
+    """Path between coordinates that the drives control: in space, or in the plane of motion.
+
+    Args:
+        robot: The robot.
+        path: Path of a tool without rotation.
+        tool: Point of the tool that follows the path, in the tool's frame, [m].
+    """
     coordinates = list(require_tcp(robot).coordinates)
     others = [k for k in range(3) if k not in coordinates]
     normal = [np.eye(3)[others[0]]] if len(others) == 1 else []
@@ -359,8 +369,9 @@ def _in_coordinates(robot: Robot, path: ToolPath) -> Path:
 
     def between(start: Array, end: Array) -> Array:
         ends = np.array([fixed, fixed])
-        ends[:, coordinates] = start, end
-        return np.asarray(path(*ends, *normal)[:, coordinates])
+        on_path = np.array([start, end])
+        ends[:, coordinates] = on_path + rotation_shift(robot, on_path, tool)
+        return place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
 
     return between
 
@@ -698,9 +709,11 @@ def _predict(
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
+    low, high = range_of_expected(session, setup, stops[first])
     if session.setups[setup].zero != "known":
         predicted = predicted - predicted[ends[first] - 1]
-    low, high = range_of_expected(session, setup)
+        if stops[first].role == "reading":
+            predicted += session.gauges[session.setups[setup].gauge].middle
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""

@@ -17,6 +17,7 @@ from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length
 from orthocal.measurement.motion.motion import (
     SetupMotion,
     Stop,
+    dial_zero,
     guide,
     plan_motion,
     range_of_expected,
@@ -347,7 +348,8 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
         f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Push "
-        "the stand lightly and release it: the hand must return to 0 within one step."
+        "the stand lightly and release it: the hand must return to "
+        f"{dial_zero(session.gauges[setup.gauge])} within one step."
     )
 
 
@@ -358,7 +360,7 @@ def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> st
             f"The tip comes within {gauge.near_hinge / MM:.1f} mm of the middle of a hinge. Check "
             "that it clears the bearing before you set the gauge zero."
         )
-    low, high = range_of_expected(session, motion.setup)
+    low, high = range_of_expected(session, motion.setup, motion.stops[0])
     beyond = [s for s in motion.stops if s.role == "reading" and not low <= s.expected <= high]
     if beyond:
         texts.append(
