@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from decimal import ROUND_CEILING, Decimal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -174,8 +175,9 @@ def rounded_up(value: float) -> str:
     """Number with two significant digits, rounded up."""
     if not math.isfinite(value) or value <= 0.0:
         return f"{value:g}"
-    decimals = 1 - math.floor(math.log10(value))
-    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.2g}"
+    number = Decimal(f"{value:.12g}")  # without the rounding errors of binary numbers
+    step = Decimal(1).scaleb(number.adjusted() - 1)
+    return f"{number.quantize(step, ROUND_CEILING).normalize():f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
