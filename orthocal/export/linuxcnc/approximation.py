@@ -30,7 +30,7 @@ from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent, find_nom
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line, total_degree
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.conditions import UseConditions, effects_by_condition, stated_use
-from orthocal.kinematics.loop_closure import find_beyond_travel
+from orthocal.kinematics.loop_closure import find_beyond_travel, require_within_travel
 from orthocal.kinematics.workspace import cube_limits, describe_box, grid_points, tool_at_zero
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
@@ -310,7 +310,7 @@ def _reach_states(
     """
     robot = calibration.robot
     errors = without_periodic_errors(robot, calibration.errors)
-    labels, states = ["a point"] * len(nodes), list[_State]()
+    states = list[_State]()
     start, expected = None, None
     for temperature, is_fitted in _list_temperatures(robot):
         conditions = UseConditions(temperature=temperature, payload=payload)
@@ -320,8 +320,7 @@ def _reach_states(
         if is_fitted:
             drives, passive = tip.reach(nodes, start=start)
             start = np.hstack([drives, passive])
-            for failure in find_beyond_travel(robot, drives, labels).values():
-                raise failure
+            require_within_travel(robot, drives, ["a point"] * len(drives))
         expected = tip.reach(checks) if expected is None else expected
         states.append(_State(temperature, tip, drives, *expected))
     return states
@@ -476,7 +475,7 @@ def _error_beyond(
     drives = inverse(points)
     if not np.isfinite(drives).all():
         return None
-    if find_beyond_travel(calibration.robot, drives, [""] * len(drives)):
+    if find_beyond_travel(calibration.robot, drives):
         return None
     return _tip_error(tip, points, drives)
 
