@@ -331,10 +331,10 @@ def test_larger_tolerance_gives_a_lower_degree(full, exported):
     )
     assert approximation.inverse.correction.degree < 4
     assert 1e-7 < approximation.achieved <= 5e-6
-    assert approximation.beyond > approximation.achieved
+    assert approximation.error_beyond > approximation.achieved
     # the tilt is a few milliradians
-    assert 1e-6 < approximation.longer < 100e-6
-    assert approximation.nominal > 1 * MM
+    assert 1e-6 < approximation.error_of_longer_tool < 100e-6
+    assert approximation.nominal_error > 1 * MM
 
 
 def test_rounded_up():
