@@ -173,13 +173,14 @@ def decide_decimal_sign(
         points = [c for c in ambiguous if "," not in c.text]
         ambiguous = [c for c in ambiguous if "," in c.text]
         if isinstance(inferred, DecimalSign) and inferred.sign == "comma" and points:
-            inferred = UnknownSign(points[0], inferred.evidence)
+            commas = [c for c in cells if _requires_comma(c.text)]
+            rare, frequent = sorted((points, commas), key=len)
+            inferred = UnknownSign(rare[0], frequent[0])
     if isinstance(inferred, DecimalSign):
         return inferred
     if inferred.evidence is not None:
         rival, other = inferred.rival, inferred.evidence
-        has_point = parse_numeral(other.text, "point") is not None
-        signs = ("comma", "point") if has_point else ("point", "comma")
+        signs = ("point", "comma") if _requires_comma(other.text) else ("comma", "point")
         raise SessionError(
             f"the reading '{shorten(rival.text)}' has a decimal {signs[0]}, and "
             f"'{shorten(other.text)}' in line {other.line} a decimal {signs[1]}; use one decimal "
@@ -195,6 +196,11 @@ def decide_decimal_sign(
         f"{format_decimal(point)} with a decimal point, and no other reading decides; {advice}",
         where=place(ambiguous[0].line),
     )
+
+
+def _requires_comma(text: str) -> bool:
+    """True for a numeral that is a number with a decimal comma only."""
+    return parse_numeral(text, "point") is None and parse_numeral(text, "comma") is not None
 
 
 def _is_ambiguous(text: str) -> bool:
