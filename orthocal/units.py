@@ -59,9 +59,19 @@ class InUnit:
         return EDGE_UNITS[self.unit][0]
 
     @property
+    def unit_in_text(self) -> str:
+        """The same unit as sentences write it."""
+        return unit_in_text(self.unit)
+
+    @property
     def edge_factor(self) -> float:
         """Factor from SI to the unit that users read."""
         return 1.0 / EDGE_UNITS[self.unit][1]
+
+
+def unit_in_text(unit: Unit) -> str:
+    """Unit that users read, as sentences write it: mm, mrad, ppm, ppm/K or µm/min."""
+    return EDGE_UNITS[unit][0].replace("um_", "µm_").replace("_per_", "/")
 
 
 def read_limit(value: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
@@ -110,6 +111,32 @@ def test_nothing_prints_outside_the_edges():
         and node.func.id == "print"
     ]
     assert printing == []
+
+
+def test_contributing_names_what_exists():
+    """Python files, and names followed by a file, such as `NAME` (`file.py`)."""
+    text = " ".join((ROOT / "CONTRIBUTING.md").read_text().split())
+    paths = [p for folder in ("orthocal", "tests", "docs") for p in (ROOT / folder).rglob("*.py")]
+
+    def find(file):
+        return [p for p in paths if p.as_posix().endswith(f"/{file}")]
+
+    files = re.findall(r"`([\w/]+\.py)`", text)
+    assert [file for file in files if not find(file)] == []
+    name = r"`[\w.]*\w(?<!\.py)`"
+    names_and_file = rf"({name}(?:(?:, |,? and |,? or ){name})*)(?: \(| in | of )`([\w/]+\.py)`"
+    mentions = re.findall(names_and_file, text)
+    assert len(mentions) > 20
+    missing = [
+        f"{name} in {file}"
+        for names, file in mentions
+        for name in re.findall(r"(\w+)`", names)
+        if not any(re.search(rf"\b{name}\b", p.read_text()) for p in find(file))
+    ]
+    assert missing == []
+    code = "".join(p.read_text() for p in paths)
+    constants_and_classes = re.findall(r"`([A-Z]\w+)`", text)
+    assert [n for n in constants_and_classes if not re.search(rf"\b{n}\b", code)] == []
 
 
 def test_functions_have_at_most_60_lines():

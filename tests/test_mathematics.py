@@ -24,6 +24,7 @@ from orthocal.estimation.linear import leg_parallelism_matrix, solve_equation_8
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.hypotheses.family_scores import N_FAMILIES
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -247,3 +248,9 @@ def test_a_rigid_motion_of_the_machine_changes_no_reading():
     )
     assert np.abs(jacobian @ theta).max() < KINEMATICS
     assert (theta != 0.0).sum() == 18
+
+
+def test_families_of_hypotheses_are_counted_as_on_the_page():
+    count = f"{N_FAMILIES:g}"
+    assert f"There are {count} families of hypotheses" in PAGE
+    assert f"The prior probability $p(H)$ is 1/{count}," in PAGE

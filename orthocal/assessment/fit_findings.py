@@ -97,7 +97,7 @@ def _mismatch(finding: Finding) -> float:
 
 
 def describe_gauge(calibration: Calibration, name: str) -> str:
-    """Attribute for readings of a gauge, such as " of the gauge 'dial'"; "" if it is the only one.
+    """Phrase for readings of a gauge, such as " of the gauge 'dial'"; "" if it is the only one.
 
     A session with a single gauge, one of several sessions, is named instead of its gauge.
     """

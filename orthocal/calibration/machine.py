@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from orthocal.arguments import require_kind, require_numbers
 from orthocal.arrays import Array
 from orthocal.kinematics.conditions import UseConditions
-from orthocal.kinematics.loop_closure import LoopClosure, as_rows, find_beyond_travel
+from orthocal.kinematics.loop_closure import LoopClosure, as_rows, require_within_travel
 from orthocal.robot.model import Robot
 
 
@@ -51,10 +51,8 @@ class Machine:
             ParameterError: If a condition is out of range, or nothing depends on it.
         """
         rows, single = as_rows(joints, len(self.robot.drives), "drive coordinates")
-        labels = names or [f"posture {i + 1}" for i in range(len(rows))]
-        for error in find_beyond_travel(self.robot, rows, labels).values():
-            raise error
-        points = self._closure(conditions).forward(rows, names=labels)
+        require_within_travel(self.robot, rows, names)
+        points = self._closure(conditions).forward(rows, names=names)
         return points[0] if single else points
 
     def inverse(

@@ -17,11 +17,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Self
+from typing import Annotated, Self
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
+from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols, add_twist
@@ -75,7 +76,7 @@ class AdjustmentKeys(EffectKeys):
     """Displacement per turn of the thread; without it the amount is the thickness of shims."""
     step_mm: PositiveNumber = 0.01
     """Smallest amount that can be set: a division of the thread, or the grading of shims."""
-    largest_mm: PositiveNumber = 1.0
+    largest_mm: Annotated[PositiveNumber, Field(le=LARGEST_AMOUNT_MM)] = 1.0
     """Largest amount in either direction."""
 
 
@@ -132,10 +133,8 @@ def find_adjustments(robot: Robot) -> tuple[Adjustment, ...]:
             compute_twists = _foot_twists if keys.lengthens is None else _rod_twists
             twists = compute_twists(keys, robot)
             if keys.largest_mm < keys.step_mm:
-                raise RobotError(
-                    f"found {keys.largest_mm:g}; expected at least step_mm, {keys.step_mm:g}",
-                    where="largest_mm",
-                )
+                found, bound = f"{keys.step_mm:g}", f"largest_mm, {keys.largest_mm:g}"
+                raise RobotError(f"found {found}; expected at most {bound}", where="step_mm")
         except RobotError as e:
             key = ".".join(part for part in (prefix, e.where) if part)
             raise RobotError(e.problem, where=f"{where}: {key}") from None
@@ -173,8 +172,6 @@ def adjustment_parameters(
 ) -> tuple[Parameter, ...]:
     """Amounts of a robot's adjustments as sums of elementary errors of its geometry.
 
-    A displacement of a drive's placement along or about the axis of the drive is its offset.
-
     Args:
         robot: The robot.
         elementary: Elementary errors of drives and geometry, by name.
@@ -202,10 +199,10 @@ def adjustment_parameters(
 def _on_frames(
     robot: Robot, placement: Placement, twist: Array, frames: set[int]
 ) -> list[tuple[Placement, Array]]:
-    """Twists of placements that have errors and together have the effect of one twist.
+    """Split the twist of a placement without errors among those with errors that it carries.
 
-    The twist of a frame without errors is passed to the next frames with errors that it carries.
-    Other twists are returned unchanged.
+    These are the next frames with errors on the kinematic chain. Other twists are returned
+    unchanged.
 
     Args:
         robot: The robot.
@@ -228,7 +225,10 @@ def _on_frames(
 
 
 def _terms(robot: Robot, placement: Placement, twist: Array) -> list[tuple[str, float]]:
-    """Elementary errors that produce a placement's twist, with coefficients."""
+    """Elementary errors that produce a placement's twist, with coefficients.
+
+    A displacement of a drive's placement along or about the axis of the drive is its offset.
+    """
     model = robot.model
     terms: list[tuple[str, float]] = []
     if placement.of_frame:
@@ -254,7 +254,8 @@ class AdjustmentChanges(Effect):
 
         twist · (c + e √(1 + (LEVER_SHARE c/rounding_std)²)),  0 for c = 0
 
-    The prior standard deviation of e is `rounding_std`.
+    The prior standard deviation of e is `rounding_std`. The root scales e to the standard deviation
+    `setting_std(c)`.
     """
 
     name = "adjustment"

@@ -82,7 +82,8 @@ class Fit:
     noises: NoiseEstimate
     """Noise of a reading of each gauge."""
     prediction: Array
-    """h at the solution, gauge zeros at 0, shape (n_entries,), [m of the first gauge]."""
+    """h at the solution, gauge zeros at 0, shape (n_entries,), [m of the first gauge]
+    (`CalibrationProblem`)."""
     jacobian: Array
     """dh/dθ̂ at the solution, shape (n_entries, n_free), [m of the first gauge per prior std]."""
     information: Information

@@ -208,9 +208,7 @@ def solve_closures(
             is singular and this is not allowed; states the posture and the residual.
     """
     count = len(targets)
-    labels = [f"posture {i + 1}" for i in range(count)] if names is None else names
-    if len(labels) != count:
-        raise ValueError(f"found {len(labels)} names for {count} rows")
+    labels = label_postures(names, count)
     first = system.start if start is None else np.asarray(start, dtype=np.float64)
     if first.shape[-1:] != (system.n_x,):
         raise ValueError(
@@ -231,6 +229,18 @@ def solve_closures(
         )
         x[points] = path.follow(x[points], restart=start is not None)
     return x.reshape(shape)
+
+
+def label_postures(names: Sequence[str] | None, count: int) -> Sequence[str]:
+    """Names of postures for messages; by default their numbers.
+
+    Raises:
+        ValueError: If there are more or fewer names than postures.
+    """
+    labels = [f"posture {i + 1}" for i in range(count)] if names is None else names
+    if len(labels) != count:
+        raise ValueError(f"found {len(labels)} names for {count} rows")
+    return labels
 
 
 class _Path:

@@ -7,8 +7,8 @@ the tool centre point to a position. `continuation` solves the equations.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,12 @@ from orthocal.arrays import Array
 from orthocal.effects.rod_forces import RodForces
 from orthocal.errors import ClosureError
 from orthocal.kinematics.conditions import UseConditions, tool_force
-from orthocal.kinematics.continuation import Failures, System, solve_closures
+from orthocal.kinematics.continuation import (
+    Failures,
+    System,
+    label_postures,
+    solve_closures,
+)
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.robot_functions import robot_functions
@@ -33,8 +38,8 @@ SOLUTION_CACHE_SIZE, MAX_CACHED_POSTURES = 16, 200
 MAX_ITERATIONS = 10
 CONDITION_TOLERANCE = 1e-9
 """Relative change at which the conditions of an inverse have converged: loads, and coordinates on
-which placements depend. They follow from its drive coordinates. Each iteration reduces their change
-by more than a factor of 100."""
+which placements depend, which follow from the drive coordinates of the inverse. Each iteration
+reduces their change by more than a factor of 100."""
 
 
 class LoopClosure:
@@ -42,7 +47,8 @@ class LoopClosure:
 
     `theta` has shape (n_free,) for one machine or (S, n_free) for a batch of machines; `errors`
     passes all elementary errors instead, shape (n_errors,) or (S, n_errors). Results of a batch
-    have a leading dimension S.
+    have a leading dimension S. Commands are drive coordinates with the conditions of effects
+    appended, shape (K, n_command) (`error_map`).
 
     Args:
         robot: The nominal robot.
@@ -86,7 +92,7 @@ class LoopClosure:
 
         Args:
             drives: Commanded drive coordinates, shape (K, n_drives) or (n_drives,), [m, rad]; or
-                commands, which include conditions (`error_map`).
+                commands.
             theta: Values of the free parameters; 0 by default.
             errors: All elementary errors, instead of theta.
             start: Start values of the passive coordinates, shape (n_passive,), (K, n_passive) or
@@ -108,7 +114,7 @@ class LoopClosure:
         values = self._all_errors(theta, errors)
 
         def solve() -> Array:
-            geometry, batch = self._batch(None, values, d)
+            geometry, batch = self._batch(d, errors=values)
             system = self._closing
             if allow_free:
                 system = copy.copy(system)
@@ -186,9 +192,10 @@ class LoopClosure:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         coordinates = require_tcp(self.robot).coordinates
-        if len(coordinates) < 3 and np.shape(points)[-1:] == (3,):
-            points = np.asarray(points)[..., list(coordinates)]
-        p, single = as_rows(points, len(coordinates), "coordinates")
+        p = _as_numbers(points, len(coordinates), "coordinates")
+        if len(coordinates) < 3 and p.shape[-1:] == (3,):
+            p = p[..., list(coordinates)]
+        p, single = as_rows(p, len(coordinates), "coordinates")
         drives, _ = self.reach(p, names=names, failures=failures)
         return drives[0] if single else drives
 
@@ -202,6 +209,9 @@ class LoopClosure:
     ) -> tuple[Array, Array]:
         """All joint coordinates that bring the tool centre point of one machine to points.
 
+        Conditions that follow from the drive coordinates, such as loads, are found by fixed-point
+        iteration: each step solves the closures under the conditions of the step before.
+
         Args:
             points: Commanded coordinates of the tool, shape (K, n_drives), [m].
             start: Start values of drive and passive coordinates, shape
@@ -213,7 +223,7 @@ class LoopClosure:
             Drive coordinates, shape (K, n_drives), and passive ones, shape (K, n_passive).
 
         Raises:
-            ClosureError: If a point cannot be reached.
+            ClosureError: If a point cannot be reached, or the conditions do not converge.
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         n = len(self.robot.drives)
@@ -228,9 +238,21 @@ class LoopClosure:
             x = self._reach(points, commands[:, :n], start, names, failures)
             before, commands = commands[:, n:], self.commands(x[:, :n])
             change = np.abs(commands[:, n:] - before)
-            if (change <= CONDITION_TOLERANCE * np.abs(before).max(axis=0, initial=0.0)).all():
+            scale = np.nan_to_num(np.abs(before)).max(axis=0, initial=0.0)
+            changing = (change > CONDITION_TOLERANCE * scale).any(axis=1)  # False at refused points
+            if not changing.any():
                 break
             start = np.where(np.isfinite(x), x, self._inverting.start)
+        for i in np.flatnonzero(changing).tolist():
+            error = ClosureError(
+                "cannot be computed: the conditions that depend on its drive coordinates, such as "
+                "loads, do not converge",
+                posture=label_postures(names, len(points))[i],
+            )
+            if failures is None:
+                raise error
+            failures.setdefault(i, error)
+            x[i] = np.nan
         return x[:, :n], x[:, n:]
 
     def _reach(
@@ -246,7 +268,7 @@ class LoopClosure:
         targets = np.hstack([points, commands[:, len(self.robot.drives) :]])
 
         def solve() -> Array:
-            geometry, _ = self._batch(None, None, commands)
+            geometry, _ = self._batch(commands)
             x: Array = solve_closures(
                 self._inverting,
                 targets,
@@ -283,7 +305,7 @@ class LoopClosure:
         """
         frame = require_tcp(self.robot).frame
         d, single = self._as_commands(drives)
-        geometry, batch = self._batch(theta, errors, d)
+        geometry, batch = self._batch(d, theta=theta, errors=errors)
         machines, n = len(geometry.drive_errors), self.robot.passive_index.size
         q = np.asarray(passive, dtype=np.float64)
         if q.ndim == 0 or q.shape[-1] != n:
@@ -346,7 +368,7 @@ class LoopClosure:
             passive: Shape (K, n_passive), [m, rad].
         """
         commands = self.commands(drives)
-        geometry, _ = self._batch(None, None, commands)
+        geometry, _ = self._batch(commands)
         return geometry.drives(commands)[0], passive, geometry.placements
 
     def _all_errors(self, theta: ArrayLike | None, errors: ArrayLike | None) -> Array:
@@ -361,7 +383,7 @@ class LoopClosure:
         return np.asarray(values[0] if single else values)
 
     def _batch(
-        self, theta: ArrayLike | None, errors: ArrayLike | None, commands: Array | None = None
+        self, commands: Array, *, theta: ArrayLike | None = None, errors: ArrayLike | None = None
     ) -> tuple[MachineGeometry, bool]:
         """Geometry with a leading dimension, and True if the arguments were a batch."""
         values = self._all_errors(theta, errors)
@@ -434,27 +456,32 @@ class LoopClosure:
         )
 
 
-class _Solutions:
-    """Cache of solutions from the reference posture, which all models of a session need."""
+class _ArrayCache:
+    """Cache of the most recently used arrays.
 
-    def __init__(self) -> None:
-        self._cached: dict[tuple[bytes, bytes], Array] = {}
+    Args:
+        size: Largest number of arrays.
+    """
 
-    def find(self, key: tuple[bytes, bytes], solve: Callable[[], Array]) -> Array:
-        """Copy of the solution of a key, solved if it is not cached."""
-        solution = self._cached.pop(key, None)
-        if solution is None:
-            solution = solve()
-        self._cached[key] = solution
-        while len(self._cached) > SOLUTION_CACHE_SIZE:
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._cached: dict[Hashable, Array] = {}
+
+    def find(self, key: Hashable, compute: Callable[[], Array]) -> Array:
+        """Copy of the array of a key, computed if it is not cached."""
+        array = self._cached.pop(key, None)
+        if array is None:
+            array = compute()
+        self._cached[key] = array
+        while len(self._cached) > self._size:
             self._cached.pop(next(iter(self._cached)), None)
-        return np.array(solution)
+        return np.array(array)
 
 
 @cached_per_robot(maxsize=8)
-def _solutions(robot: Robot) -> _Solutions:
-    """Cache of the solutions of a robot, shared by all its closures."""
-    return _Solutions()
+def _solutions(robot: Robot) -> _ArrayCache:
+    """Solutions of a robot from the reference posture, which all models of a session need."""
+    return _ArrayCache(SOLUTION_CACHE_SIZE)
 
 
 @cached_per_robot(maxsize=8)
@@ -474,16 +501,15 @@ class _UnitRodForces:
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._forces = robot, RodForces(robot)
-        self._cached = lru_cache(maxsize=FORCE_CACHE_SIZE)(self._compute)
+        self._cache = _ArrayCache(FORCE_CACHE_SIZE)
 
     def __call__(self, drives: Array) -> Array:
         """∂p/∂ℓ of all rods, shape (K, n_rods, 3); 0 in postures out of reach."""
-        return self._cached(np.ascontiguousarray(drives).tobytes())
+        return self._cache.find(drives.tobytes(), lambda: self._compute(drives))
 
-    def _compute(self, content: bytes) -> Array:
-        """Forces for the bytes of drive coordinates."""
-        robot, n = self._robot, len(self._robot.drives)
-        drives = np.frombuffer(content).reshape(-1, n)
+    def _compute(self, drives: Array) -> Array:
+        """Forces at drive coordinates, shape (K, n_drives)."""
+        robot = self._robot
         result = np.zeros((len(drives), len(robot.rods), 3))
         passive = nominal_closure(robot).close(drives, failures={}) if drives.size else drives
         reached = np.isfinite(passive).all(axis=1)
@@ -516,15 +542,15 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
     return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), forces))
 
 
-def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Failures:
-    """Rows of drive coordinates beyond the travel of a drive, with the reason.
+def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> Failures:
+    """Rows of drive coordinates beyond the travel of a drive in their order, with the reason.
 
     Args:
         robot: The robot.
         drives: Shape (K, n_drives), [m, rad].
-        names: Names of the postures, for messages.
+        names: Names of the postures, for messages; by default their numbers.
     """
-    failures: Failures = {}
+    failures, labels = Failures(), label_postures(names, len(drives))
     for drive, values in zip(robot.drives, drives.T, strict=True):
         factor, unit = drive.edge_factor, drive.edge_unit
         for i in np.flatnonzero(drive.is_beyond(values)).tolist():
@@ -532,8 +558,30 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Fai
                 f"{drive.name}_{unit} is {values[i] * factor:g}; the drive reaches from "
                 f"{drive.lower * factor:g} to {drive.upper * factor:g}"
             )
-            failures.setdefault(i, ClosureError(reason, posture=names[i]))
-    return failures
+            failures.setdefault(i, ClosureError(reason, posture=labels[i]))
+    return dict(sorted(failures.items()))
+
+
+def require_within_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> None:
+    """Refuse drive coordinates beyond the travel of a drive.
+
+    Raises:
+        ClosureError: Of `find_beyond_travel`, for the first such row.
+    """
+    for failure in find_beyond_travel(robot, drives, names).values():
+        raise failure
+
+
+def _as_numbers(values: ArrayLike, n: int, noun: str) -> Array:
+    """Numbers as an array.
+
+    Raises:
+        ValueError: If they are not numbers, or rows have different lengths.
+    """
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"found {type(values).__name__}; expected {n} {noun} per row") from None
 
 
 def as_rows(values: ArrayLike, n: int, noun: str) -> tuple[Array, bool]:
@@ -542,10 +590,7 @@ def as_rows(values: ArrayLike, n: int, noun: str) -> tuple[Array, bool]:
     Raises:
         ValueError: If they are not numbers, or if a row does not have n of them.
     """
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"found {type(values).__name__}; expected {n} {noun} per row") from None
+    array = _as_numbers(values, n, noun)
     if array.ndim not in (1, 2) or array.shape[-1] != n:
         raise ValueError(f"found the shape {array.shape}; expected {n} {noun} per row, (K, {n})")
     return np.atleast_2d(array), array.ndim == 1

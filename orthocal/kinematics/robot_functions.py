@@ -213,7 +213,7 @@ class RobotFunctions:
     @cached_property
     def twist_pattern(self) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of ∂g/∂ξ, column by column."""
-        return self.closure_jacobian.pattern("y3")
+        return self.closure_jacobian.patterns["y3"]
 
     @cached_property
     def closure_expressions(self) -> ca.Function:

@@ -519,7 +519,7 @@ class ReadingLinearisation:
                 for j in np.flatnonzero(self._aligned[which].any(axis=0)).tolist():
                     by_machine = h_nu[:, :, j, None] * self._alignment[which[:, j]]
                     result.by_alignment[:, where] += by_machine
-            _, columns = group.reading.jacobian.pattern("by_twists")
+            _, columns = group.reading.jacobian.patterns["by_twists"]
             by_twists.append((where, columns, nonzeros))
         return result
 

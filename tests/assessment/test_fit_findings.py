@@ -10,7 +10,7 @@ import pytest
 from calibrated import identified, session_of
 
 from orthocal.assessment.fit_findings import _above_tolerances, _linearisation
-from orthocal.units import MM
+from orthocal.units import MM, PPM
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +40,10 @@ def test_the_error_of_an_effect_is_compared_with_its_stated_value(calibration):
         SimpleNamespace(robot=robot, free=[replace(stated, mean=0.0, value=0.02 * MM)])
     )
     assert "is estimated to be 0.020 mm, 5 times its tolerance" in found.text
+    expansion = replace(stated, unit="1/K", mean=0.0, value=20 * PPM, prior_std=2 * PPM)
+    (found,) = _above_tolerances(SimpleNamespace(robot=robot, free=[expansion]))
+    assert "is estimated to be 20.000 ppm/K, 5 times" in found.text
+    assert [*found.numbers] == ["value_ppm_per_K", "tolerance_ppm_per_K"]
 
 
 def test_a_parameter_at_a_bound_does_not_hide_the_linearisation_error(calibration):

@@ -38,10 +38,11 @@ from orthocal.output.text.answer import render_decision
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import result_json
 from orthocal.session.session import Conditions
+from orthocal.units import DRIVE_UNITS, EDGE_UNITS
 
 QUICK = {"solver": "variable-projection"}
 
-UNITS = ("_mm", "_um", "_mrad", "_deg")
+UNITS = ("_um", *(f"_{unit}" for unit, _ in (*EDGE_UNITS.values(), *DRIVE_UNITS.values())))
 
 PURE = {
     *("cycle", "finer", "ratio", "tolerance_scale", "log_posterior_odds", "log_evidence"),
@@ -317,6 +318,12 @@ def test_an_offset_at_a_bound_is_to_be_reviewed(cycles):
     (held,) = found.of_kind("held by a bound")
     assert held.numbers == {"value_mm": pytest.approx(0.5)}
     assert found.decision.verdict == "review"
+    bounds = {"x_slide.scale_ppm": (-1.0, 1.0)}
+    choice = Choice(free=["*.offset", "x_slide.scale"], bounds=bounds)
+    (held,) = calibrate(cycles, choice, **UNJUDGED).assessment.of_kind("held by a bound")
+    assert held.severity == "note"
+    assert [*held.numbers] == ["value_ppm"]
+    assert abs(held.numbers["value_ppm"]) == pytest.approx(1.0)
 
 
 def test_readings_are_compared_with_the_resolution_of_their_gauge(workshop):

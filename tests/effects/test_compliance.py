@@ -23,10 +23,11 @@ from orthocal import (
     write_session,
 )
 from orthocal.calibration.identify import identify
-from orthocal.errors import RobotError, SessionError
+from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics import loop_closure
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure, find_loads, nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -106,6 +107,17 @@ def test_the_inverse_under_load_returns_the_drives(soft):
     back = closure.inverse(beyond, failures=failures)
     assert list(failures) == [3]
     assert np.abs(back[:3] - drives).max() < CLOSED
+
+
+def test_loads_that_do_not_converge_are_refused(soft, monkeypatch):
+    monkeypatch.setattr(loop_closure, "MAX_ITERATIONS", 1)
+    closure, failures = LoopClosure(soft, conditions=UseConditions()), {}
+    with pytest.raises(ClosureError, match=r"posture 'posture 1' .* do not converge"):
+        closure.inverse(POSTURES)
+    drives = closure.inverse([*POSTURES, (1.0, 1.0, 1.0)], failures=failures)
+    assert sorted(failures) == [0, 1, 2, 3]
+    assert np.isnan(drives).all()
+    assert "cannot be reached" in str(failures[3])
 
 
 def test_the_tool_under_conditions_follows_its_derivatives(tmp_path):

@@ -331,14 +331,18 @@ def test_larger_tolerance_gives_a_lower_degree(full, exported):
     )
     assert approximation.inverse.correction.degree < 4
     assert 1e-7 < approximation.achieved <= 5e-6
-    assert approximation.beyond > approximation.achieved
+    assert approximation.error_beyond > approximation.achieved
     # the tilt is a few milliradians
-    assert 1e-6 < approximation.longer < 100e-6
-    assert approximation.nominal > 1 * MM
+    assert 1e-6 < approximation.error_of_longer_tool < 100e-6
+    assert approximation.nominal_error > 1 * MM
 
 
 def test_rounded_up():
-    assert [rounded_up(v) for v in (0.02801, 0.028, 12.1, 1.0)] == ["0.029", "0.028", "13", "1"]
+    numbers = {0.02801: "0.029", 0.028: "0.028", 12.1: "13", 1.0: "1", 99.2: "100", 184.3: "190"}
+    assert [rounded_up(v) for v in numbers] == list(numbers.values())
+    # a number of two digits is not changed
+    numbers = [f"0.{digits}" for digits in range(11, 100) if digits % 10]
+    assert [rounded_up(float(text)) for text in numbers] == numbers
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_core_equals_the_machine_at_every_temperature(thermal):
     drives = drives_of(known.robot, core.at(22.0).inverse(points / MM))
     reached = known.machine.forward(drives, conditions=UseConditions(temperature=37.0))
     error = np.linalg.norm(reached - points, axis=1).max()
-    assert 20e-6 < error < approximation.unheated < 1.5 * error
+    assert 20e-6 < error < approximation.error_without_thermometer < 1.5 * error
 
 
 def test_core_reaches_points_on_an_independent_machine(tmp_path):
@@ -177,7 +177,7 @@ def test_module_corrects_the_deflection_by_a_payload(tmp_path, monkeypatch):
         assert np.linalg.norm(tool - point) < approximation.achieved + SECOND_ORDER
         heavier, _ = settle(drives, stiffness=1e6, weight=weight * 9.0 / 8.0)
         error = np.linalg.norm(heavier - point)
-        assert 1e-6 < error < approximation.heavier < 5.0 * error
+        assert 1e-6 < error < approximation.error_of_heavier_payload < 5.0 * error
 
 
 SECOND_ORDER = 50e-9
@@ -187,14 +187,14 @@ SECOND_ORDER = 50e-9
 def test_page_states_temperature_and_payload(thermal):
     known, approximation, _ = thermal
     known = SimpleNamespace(**vars(known), only_offsets=False)
-    loaded = replace(approximation, payload=0.5, heavier=1.2e-6)
+    loaded = replace(approximation, payload=0.5, error_of_heavier_payload=1.2e-6)
     page = write_module_page(known, loaded, homes_of(known), stated=True)
     assert "`orthocal.temperature`" in page
     assert "From 7 to 37 °C" in page
     assert "for 0.5 kg on the tool" in page
     assert "1 kg more the\nerror is up to 1.2 µm" in page
     unheated = float(re.search(r"Without a thermometer .* up to ([\d.]+) mm", page)[1])
-    assert unheated * MM == pytest.approx(approximation.unheated, rel=0.1)
+    assert unheated * MM == pytest.approx(approximation.error_without_thermometer, rel=0.1)
     assert "hal_pin_float_newf" in write_component(approximation)["orthocal_kins.c"]
 
 
@@ -203,7 +203,12 @@ def test_module_without_thermal_expansion_has_no_pin(tmp_path):
     approximation = approximate(known, within=1e-6, half_side=SMALL)
     files = write_core(known, approximation, homes_of(known))
     assert "#define ORTHOCAL_THERMAL 0\n" in files["orthocal_core.h"]
-    assert approximation.unheated is approximation.payload is approximation.heavier is None
+    assert (
+        approximation.error_without_thermometer
+        is approximation.payload
+        is approximation.error_of_heavier_payload
+        is None
+    )
     with pytest.raises(ParameterError) as caught:
         approximate(known, within=1e-6, payload=1.0)
     assert caught.value.where == "--payload"

@@ -56,6 +56,18 @@ def test_a_row_of_an_input_holds_for_successive_points(orthoglide, backend):
         assert_same(function.evaluate(*where[:2], placements, backend=backend), expected)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("shapes", [
+    ((5, 3), (2, 2)), ((4, 3), (3, 2)), ((5, 1), (1, 2)), ((5, 2), (1, 2)), ((5, 3),),
+    ((1, 5, 3), (1, 2)),
+])  # fmt: skip
+def test_inputs_of_other_shapes_are_refused(shapes, backend):
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
+    batch = BatchFunction(ca.Function("f", [x, y], [ca.dot(x, x) * y]))
+    with pytest.raises(ValueError, match="expected 3, 2 columns"):
+        batch.evaluate(*map(np.ones, shapes), backend=backend)
+
+
 @pytest.mark.parametrize("count", [llvm.LANES - 3, 101])
 def test_every_operation_is_casadis(count):
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
@@ -148,7 +160,7 @@ def test_a_large_function_is_loaded_only_for_casadi(orthoglide, tmp_path, monkey
     for times in (1, 1):  # the first call stores layout and instructions
         batch = fresh()
         assert_same(batch.evaluate(*where, backend="llvm"), expected)
-        for ours, theirs in zip(batch.pattern("y3"), original.pattern("y3"), strict=True):
+        for ours, theirs in zip(batch.patterns["y3"], original.patterns["y3"], strict=True):
             assert np.array_equal(ours, theirs)
         assert len(loaded) == times
     assert_same(fresh().evaluate(*where, backend="casadi"), expected)

@@ -169,6 +169,11 @@ def test_coordinates_that_are_not_numbers_are_refused(orthoglide):
         nominal_closure(orthoglide).close([[np.nan, 0.3, 0.3]], names=["here"])
 
 
+def test_rows_of_different_lengths_are_refused(biglide):
+    with pytest.raises(ValueError, match="found list; expected 2 coordinates per row"):
+        nominal_closure(biglide).inverse([[0.0, 0.0, 0.0], [0.0, 0.0]])
+
+
 def test_a_singular_posture_is_refused(biglide):
     """Sliders so far out that both rods lie on one line: the tool is free across it."""
     far = 0.2 * np.sqrt(2.0)

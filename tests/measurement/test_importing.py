@@ -499,7 +499,7 @@ def test_a_dry_run_prints_the_same_and_writes_nothing(session, orthocal):
 
 
 def test_json_report(session, orthocal):
-    table = put(session, "Setup;posture;T;Wert\nXY;zero;21;-12,5\n;;;\nxy;x_max;21;\nEnde\n")
+    table = put(session, "Setup;posture;T;Wert\nXY;zero;21;-12,5;gut\n;;;\nxy;x_max;21;\nEnde\n")
     code, out, _ = orthocal("import", table, session, "--json", "--unit", "um")
     assert code == 0
     document = json.loads(out)
@@ -511,7 +511,9 @@ def test_json_report(session, orthocal):
     assert (document["encoding"], document["separator"]) == ("utf-8", "semicolon")
     assert document["decimal"] == "comma"
     assert document["unused"] == ["'T'"]
-    assert document["skipped"] == [{"row": 5, "reason": "no reading"}]
+    assert document["skipped"] == [
+        {"row": 2, "reason": "1 cell without a heading"}, {"row": 5, "reason": "no reading"}
+    ]  # fmt: skip
     assert document["rows_without_reading"] == [4]
     assert document["renamed"] == {"XY": "xy"}
     assert document["written"] == f"{session}/readings.csv"
@@ -597,6 +599,12 @@ def test_temperatures_of_a_table(heading, cells, expected, session):
         return
     loaded = [r.conditions and r.conditions.temperature for r in load_session(session).readings]
     assert loaded == expected
+
+
+def test_temperatures_have_the_unit_of_their_number_format(session):
+    rows = [["setup", "posture", "reading [mm]", "temperature"], ["xy", "zero", 0.5, 41]]
+    form = book("fahrenheit", rows, edit=in_sheet("D2", number_format='0.0 "°F"'))
+    assert [float(r.temperature_C) for r in read(session, form).long_table.rows] == [5.0]
 
 
 def test_merged_cells_of_conditions_apply_to_all_their_rows(session):

@@ -113,7 +113,7 @@ def read(content: bytes, **options) -> dict[tuple[str, str, int], Decimal]:
     path = Path("table")
     table = read_table(path, content, find_header, expected=EXPECTED)
     columns = choose_columns(table.header, {}, where="table")
-    long = make_long_table(table, columns, names=NAMES, **options)
+    long = make_long_table(table, columns, **{"names": NAMES, **options})
     found = {(r.setup, r.posture, int(r.cycle or 1)): Decimal(r.reading_mm) for r in long.rows}
     assert len(found) == len(long.rows)
     return found
@@ -175,3 +175,12 @@ def test_numbers_of_a_workbook_are_imported_exactly(values, as_text, unit):
         assert as_text  # 1,234 alone is two numbers
         found = read(stream.getvalue(), decimal="comma")
     assert [*found.values()] == [value * UNITS[unit] for value in values]
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"), [("x_max", "x_max"), ("X_MAX", "X_MAX"), ("X_Max", "X_Max")]
+)
+def test_a_name_that_two_names_of_the_session_match_is_not_replaced(written, expected):
+    content = f"setup,posture,reading_mm\nXY,{written},1\n".encode()
+    found = read(content, names={"setup": ["xy"], "posture": ["x_max", "X_MAX"]})
+    assert found == {("xy", expected, 1): 1}

@@ -107,11 +107,12 @@ def test_empty_columns_are_not_written(session, tmp_path):
 def test_the_formats_of_a_spreadsheet_are_read(tmp_path):
     table = (
         "setup;posture;reading_mm;approach;temperature_C;time\n"
-        "yx;zero;0,01;ppp;21,5;2025-03-14 09:26\nyx;zero;0,02;npp;;\n"
+        "yx;zero;0,01;ppp;21,5;2025-03-14 09:26\nyx;zero;0,02;npp;20.125;\n"
     )
     found = load_session(write(tmp_path / "first", table)).readings
     assert found[0].conditions == Conditions("ppp", 21.5, datetime(2025, 3, 14, 9, 26))
     assert found[1].value == pytest.approx(0.02e-3)
+    assert found[1].conditions.temperature == 20.125
 
 
 def test_times_without_zone_are_kept(tmp_path):

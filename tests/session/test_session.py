@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibrated import session_of
@@ -118,6 +120,14 @@ def test_a_loaded_session_is_the_written_one(tmp_path, example):
     for name, posture in session.postures.items():
         assert np.abs(again.postures[name].drives - posture.drives).max() < CLOSED_FORM
     assert (again.controller_offsets is None) == (session.controller_offsets is None)
+
+
+def test_a_name_that_would_not_load_is_not_written(tmp_path, raw_cycles):
+    posture = replace(raw_cycles.postures["zero"], name="a,b")
+    session = replace(raw_cycles, postures={**raw_cycles.postures, "a,b": posture})
+    with pytest.raises(SessionError, match="without blanks, commas"):
+        write_session(session, tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
 
 
 @settings(max_examples=20, deadline=None)

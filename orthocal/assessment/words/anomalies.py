@@ -33,7 +33,7 @@ from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
 from orthocal.text import capitalised, spans, uncapitalised
-from orthocal.units import EDGE_UNITS, MM, UM, Unit
+from orthocal.units import EDGE_UNITS, MM, UM, Unit, unit_in_text
 
 MAX_PLACES = 1000
 """Largest number of places in a finding, which limits the size of calibration.json."""
@@ -452,8 +452,9 @@ def _amounts(e: Explanation) -> str:
     """Significant parameters of an effect, such as "x_slide.backlash 0.045 ± 0.010 mm"."""
     texts = []
     for name, amount, std, unit in _significant_amounts(e):
-        edge, factor = EDGE_UNITS[unit]
-        texts.append(f"{name} {plain(amount / factor)} ± {plain(2.0 * std / factor)} {edge}")
+        _, factor = EDGE_UNITS[unit]
+        shown = f"{plain(amount / factor)} ± {plain(2.0 * std / factor)}"
+        texts.append(f"{name} {shown} {unit_in_text(unit)}")
     return joined(texts)
 
 

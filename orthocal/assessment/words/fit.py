@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, signed, times
+from orthocal.assessment.wording import (
+    counted,
+    mm,
+    note,
+    parameter_places,
+    plain,
+    review,
+    signed,
+    times,
+)
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
@@ -121,7 +130,7 @@ def gauge_overstated(sigma: float, stated: float, of_gauge: str) -> Finding:
     Args:
         sigma: Standard deviation of a reading from the residuals, [m].
         stated: That of the gauge, [m].
-        of_gauge: Attribute that names the gauge; empty if there is only one.
+        of_gauge: Phrase such as " of the gauge 'dial'"; empty if there is only one gauge.
     """
     return note(
         "gauge overstated",
@@ -139,7 +148,8 @@ def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
     Args:
         readings: Number of independent readings.
         parameters: Number of free errors of the machine.
-        mounting: True if further readings determine only the mounting of gauges.
+        mounting: True if readings beyond those that determine the errors serve the mounting of
+            gauges.
     """
     further = " and the mounting of the gauges" if mounting else ""
     return note(
@@ -173,39 +183,38 @@ def nothing_deviates(rms: float) -> Finding:
 
 def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
     """Finding about a parameter at a bound; `offset` if it is an offset, to be reviewed."""
-    return Finding(
+    value = parameter.value * parameter.edge_factor
+    return (review if offset else note)(
         "held by a bound",
-        "review" if offset else "note",
-        f"{parameter.name} is at its {parameter.at_bound} bound, "
-        f"{parameter.value * parameter.edge_factor:g} {parameter.edge_unit}. The best fit is "
-        "beyond it. Its uncertainty is unknown; that of the other parameters assumes this value.",
+        f"{parameter.name} is at its {parameter.at_bound} bound, {value:g} "
+        f"{parameter.unit_in_text}. The best fit is beyond this bound. The uncertainty of this "
+        "parameter is unknown; that of the other parameters assumes this value.",
         "Make sure that this bound is intended.",
-        {
-            f"value_{parameter.edge_unit}" if parameter.unit != "1" else "value": parameter.value
-            * parameter.edge_factor
-        },
         parameter_places(parameter.name),
+        **{f"value_{parameter.edge_unit}": value},
     )
 
 
 def effect_above_tolerance(parameter: ParameterEstimate) -> Finding:
     """Finding about an error of an effect, such as a backlash, far above its tolerance."""
-    unit, factor = parameter.edge_unit, parameter.edge_factor
+    unit, factor = parameter.unit_in_text, parameter.edge_factor
     tolerance, error = show_limit(parameter.prior_std), parameter.value - parameter.mean
-    estimate = f"estimated to be {plain(parameter.value * factor)} {unit}"
+    estimate = f"{parameter.name} is estimated to be {plain(parameter.value * factor)} {unit}"
+    consequence = "the estimate is too small"
     if parameter.mean:
         estimate += f", {signed(error * factor)} {unit} from its stated value"
+        consequence = "the estimate is too close to the stated value"
     return note(
         "above tolerances",
-        f"{parameter.name} is {estimate}, {times(abs(error) / tolerance)} its tolerance. So small "
-        "a tolerance keeps the estimate too close to the stated value."
-        if parameter.mean
-        else f"{parameter.name} is {estimate}, {times(abs(error) / tolerance)} its tolerance. With "
-        "so small a tolerance the estimate is too small.",
+        f"{estimate}, {times(abs(error) / tolerance)} its tolerance. With so small a tolerance "
+        f"{consequence}.",
         "Check this part of the machine. If it is so far off, state a larger tolerance and "
         "calibrate again.",
         parameter_places(parameter.name),
-        **{f"value_{unit}": parameter.value * factor, f"tolerance_{unit}": tolerance * factor},
+        **{
+            f"value_{parameter.edge_unit}": parameter.value * factor,
+            f"tolerance_{parameter.edge_unit}": tolerance * factor,
+        },
     )
 
 
@@ -220,7 +229,7 @@ def linearisation_error(parameter: ParameterEstimate, change: float, std: float)
     return note(
         "linearisation error",
         "Most changed by linearisation, relative to its uncertainty: "
-        f"{parameter.name} by {plain(change * parameter.edge_factor)} {parameter.edge_unit}, "
+        f"{parameter.name} by {plain(change * parameter.edge_factor)} {parameter.unit_in_text}, "
         f"{change / std:.2g} times its standard deviation.",
         "",
         parameter_places(parameter.name),

@@ -74,7 +74,7 @@ def beyond_tolerances(
 def outstanding_error(parameter: Parameter, error: float) -> Finding:
     """Finding about one error far beyond its tolerance, [SI], that explains the readings."""
     error, tolerance = (v * parameter.edge_factor for v in (error, show_limit(parameter.prior_std)))
-    unit = parameter.edge_unit
+    unit, key_unit = parameter.unit_in_text, parameter.edge_unit
     action = (
         "Measure that place or part again. If it is so far off, state its true value or a larger "
     )
@@ -90,7 +90,7 @@ def outstanding_error(parameter: Parameter, error: float) -> Finding:
         f"{unit}. Its tolerance is ±{tolerance:g} {unit}.",
         f"{action}tolerance.",
         parameter_places(parameter.name),
-        **{f"error_{unit}": error, f"tolerance_{unit}": tolerance},
+        **{f"error_{key_unit}": error, f"tolerance_{key_unit}": tolerance},
     )
 
 

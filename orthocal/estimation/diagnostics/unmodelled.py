@@ -5,7 +5,8 @@ first order, unmodelled errors θᵤ bias the estimate by B θᵤ,
 
     B = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P⁻¹
 
-The priors of θᵤ therefore add a covariance to the uncertainty of the estimate.
+The priors of θᵤ therefore add a covariance to the uncertainty of the estimate. Readings are in
+metres of the first gauge (`CalibrationProblem`).
 """
 
 from __future__ import annotations
@@ -100,11 +101,10 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
     """
     problem = fit.problem
     parameters = problem.robot.parameters
-    # a sum models its first error; the other errors may differ from it
+    # a free sum counts only its first term as modelled
     free = problem.machine_selection.names
     modelled = {parameters[n].terms[0][0] for n in (*free, *problem.fixed, *represented)}
-    others = [n for n in machine_errors(problem.robot) if n not in represented]
-    names = parameters.without_terms(others, modelled)
+    names = parameters.without_terms(machine_errors(problem.robot), modelled)
     o = problem.observations
     if not names:
         none = np.zeros(0, dtype=np.bool_)
@@ -155,12 +155,12 @@ def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[Unmodelled
         return no_effect, np.zeros((problem.n_free - n, 0))
     o, sigma = problem.observations, fit.sigma
     jacobian = project_out_zeros(fit.jacobian, o)
-    inverse = fit.information.posterior(
+    covariance = fit.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
     ).covariance
-    scaled = inverse @ (jacobian.T @ errors.jacobian) / sigma**2
-    residual = o.rows(errors.jacobian - jacobian @ scaled)
-    bias = scaled * problem.theta_scale[:, None]  # per prior standard deviation of each error
+    scaled_bias = covariance @ (jacobian.T @ errors.jacobian) / sigma**2
+    residual = o.rows(errors.jacobian - jacobian @ scaled_bias)
+    bias = scaled_bias * problem.theta_scale[:, None]  # per prior standard deviation of each error
     effect = UnmodelledEffect(
         names=errors.names,
         prior_stds=errors.prior_stds,

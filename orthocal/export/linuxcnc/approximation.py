@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from decimal import ROUND_CEILING, Decimal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +30,7 @@ from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent, find_nom
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line, total_degree
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.conditions import UseConditions, effects_by_condition, stated_use
-from orthocal.kinematics.loop_closure import find_beyond_travel
+from orthocal.kinematics.loop_closure import find_beyond_travel, require_within_travel
 from orthocal.kinematics.workspace import cube_limits, describe_box, grid_points, tool_at_zero
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
@@ -140,20 +141,20 @@ class Approximation:
     """Largest error of the tip at the checked points times ERROR_MARGIN, [m]."""
     checked: int
     """Number of checked points."""
-    nominal: float | None
+    nominal_error: float | None
     """Largest error with nominal kinematics and the offsets active during the measurement, [m];
-    None for a robot without a closed form."""
-    beyond: float | None
+    None for a robot without a closed form, or if a point is out of reach."""
+    error_beyond: float | None
     """Largest error 5 mm beyond the faces, [m]; None if the machine does not reach that far."""
-    longer: float
+    error_of_longer_tool: float
     """Largest error for a tip 10 mm farther in any direction, [m]."""
-    unheated: float | None
+    error_without_thermometer: float | None
     """Largest error without a thermometer over the range of temperatures, [m]; None if the machine
     does not depend on temperature."""
     payload: float | None
     """Mass on the tool for which the approximation holds, [kg]; None if the machine does not depend
     on it."""
-    heavier: float | None
+    error_of_heavier_payload: float | None
     """Largest error with 1 kg more on the tool, [m]; None if the machine does not depend on it."""
 
     @property
@@ -174,8 +175,9 @@ def rounded_up(value: float) -> str:
     """Number with two significant digits, rounded up."""
     if not math.isfinite(value) or value <= 0.0:
         return f"{value:g}"
-    decimals = 1 - math.floor(math.log10(value))
-    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.2g}"
+    number = Decimal(f"{value:.12g}")  # without the rounding errors of binary numbers
+    step = Decimal(1).scaleb(number.adjusted() - 1)
+    return f"{number.quantize(step, ROUND_CEILING).normalize():f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,12 +265,12 @@ def approximate(
     change, refused = _find_change(states), list[CorrectedInverse]()
     for degree in range(1, max_degree + 1):
         fit = PolynomialFit(nodes, total_degree(n, degree))
-        thermal = None if change is None else change.fitted(fit, middle, half)
+        thermal = change and ThermalChange(*change[0], fit(middle, half, change[1]))
         inverse = CorrectedInverse(form, fit(middle, half, corrections), thermal)
         if _largest_error(states, checks, inverse, rows=slice(-QUICK_CHECKS, None)) <= within:
             error = _largest_error(states, checks, inverse)
             if error <= within:
-                return _describe(calibration, states, inverse, checks, error, payload)
+                return _assess(calibration, states, inverse, checks, error, payload)
         refused.append(inverse)
     best = min(_largest_error(states, checks, inverse) for inverse in refused)
     raise ExportError(
@@ -308,8 +310,8 @@ def _reach_states(
     """
     robot = calibration.robot
     errors = without_periodic_errors(robot, calibration.errors)
-    labels, states = ["a point"] * len(nodes), list[_State]()
-    start, expected = None, None
+    states = list[_State]()
+    start, at_checks = None, None
     for temperature, is_fitted in _list_temperatures(robot):
         conditions = UseConditions(temperature=temperature, payload=payload)
         tip, drives = ToolTip(calibration, tool, errors=errors, conditions=conditions), None
@@ -318,10 +320,9 @@ def _reach_states(
         if is_fitted:
             drives, passive = tip.reach(nodes, start=start)
             start = np.hstack([drives, passive])
-            for failure in find_beyond_travel(robot, drives, labels).values():
-                raise failure
-        expected = tip.reach(checks) if expected is None else expected
-        states.append(_State(temperature, tip, drives, *expected))
+            require_within_travel(robot, drives, ["a point"] * len(drives))
+        at_checks = tip.reach(checks) if at_checks is None else at_checks
+        states.append(_State(temperature, tip, drives, *at_checks))
     return states
 
 
@@ -343,24 +344,14 @@ def _list_temperatures(robot: Robot) -> list[tuple[float | None, bool]]:
     return [(reference, True), *((end, True) for end in ends), *between]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Change:
-    """Change of the drive coordinates at the nodes with temperature."""
+def _find_change(states: Sequence[_State]) -> tuple[tuple[float, float, float], Array] | None:
+    """Change of the drive coordinates at the nodes with temperature; None without temperatures.
 
-    temperatures: Array
-    """Fitted temperatures, the reference first, [°C]."""
-    per_kelvin: Array
-    """Change of the drive coordinates at the nodes, shape (n_nodes, n_drives), [m/K, rad/K]."""
-
-    def fitted(self, fit: PolynomialFit, middle: Array, half: Array) -> ThermalChange:
-        """Polynomial of the change in a box."""
-        t = self.temperatures
-        limits = float(t[0]), float(t.min()), float(t.max())
-        return ThermalChange(*limits, fit(middle, half, self.per_kelvin))
-
-
-def _find_change(states: Sequence[_State]) -> _Change | None:
-    """Least-squares line through the first state (the reference) and near the other fitted ones."""
+    Returns:
+        Reference, lowest and highest temperature, [°C]; slopes of the least-squares lines through
+        the first state (the reference) and near the other fitted ones, shape (n_nodes, n_drives),
+        [m/K, rad/K].
+    """
     fitted = [(s.temperature, s.drives) for s in states if s.drives is not None]
     if len(fitted) == 1:
         return None
@@ -368,10 +359,11 @@ def _find_change(states: Sequence[_State]) -> _Change | None:
     drives = np.array([d for _, d in fitted])
     differences = temperatures - temperatures[0]
     per_kelvin = np.tensordot(differences, drives - drives[0], axes=1)
-    return _Change(temperatures, per_kelvin / (differences @ differences))
+    limits = float(temperatures[0]), float(temperatures.min()), float(temperatures.max())
+    return limits, per_kelvin / (differences @ differences)
 
 
-def _describe(
+def _assess(
     calibration: Calibration,
     states: Sequence[_State],
     inverse: CorrectedInverse,
@@ -394,14 +386,16 @@ def _describe(
         coordinates=tuple(first.tip.coordinates),
         achieved=error,
         checked=len(checks),
-        nominal=_nominal_error(first.tip, inverse.nominal, checks, calibration.active_offsets),
-        beyond=_error_beyond(first.tip, inverse, calibration),
-        longer=_error_of_longer_tool(first.tip, first.expected, first.passive),
-        unheated=max(
+        nominal_error=_nominal_error(
+            first.tip, inverse.nominal, checks, calibration.active_offsets
+        ),
+        error_beyond=_error_beyond(first.tip, inverse, calibration),
+        error_of_longer_tool=_error_of_longer_tool(first.tip, first.expected, first.passive),
+        error_without_thermometer=max(
             (s.error(checks, inverse, at_reference=True) for s in states[1:]), default=None
         ),
         payload=payload,
-        heavier=heavier,
+        error_of_heavier_payload=heavier,
     )
 
 
@@ -474,7 +468,7 @@ def _error_beyond(
     drives = inverse(points)
     if not np.isfinite(drives).all():
         return None
-    if find_beyond_travel(calibration.robot, drives, [""] * len(drives)):
+    if find_beyond_travel(calibration.robot, drives):
         return None
     return _tip_error(tip, points, drives)
 

@@ -239,19 +239,19 @@ def _between_entries(tables: Sequence[JointCompensation]) -> str:
 def _describe_conditions(approximation: Approximation) -> str:
     """Paragraphs about temperature and payload; empty if the machine depends on neither."""
     paragraphs, change = [], approximation.inverse.thermal
-    if change is not None and approximation.unheated is not None:
+    if change is not None and approximation.error_without_thermometer is not None:
         values = {
             "reference": f"{change.reference:g}",
             "lowest": f"{change.lowest:g}",
             "highest": f"{change.highest:g}",
-            "unheated": rounded_up(approximation.unheated / MM),
+            "unheated": rounded_up(approximation.error_without_thermometer / MM),
         }
         paragraphs.append(fill_template("temperature.md", values))
-    if approximation.payload is not None and approximation.heavier is not None:
+    if approximation.payload is not None and approximation.error_of_heavier_payload is not None:
         values = {
             "payload": f"{approximation.payload:g}",
             "more": f"{HEAVIER_PAYLOAD:g}",
-            "error": rounded_up(max(approximation.heavier, SMALLEST_ERROR) / UM),
+            "error": rounded_up(max(approximation.error_of_heavier_payload, SMALLEST_ERROR) / UM),
         }
         paragraphs.append(fill_template("payload.md", values))
     return "".join(f"\n{paragraph}" for paragraph in paragraphs)
@@ -355,12 +355,11 @@ def write_module_page(
     else:
         form = f"The inverse kinematics are the nominal closed form, corrected by\n{form}."
     nominal = beyond = ""
-    if approximation.nominal is not None:
-        nominal = (
-            f"With nominal kinematics the error is up to {approximation.nominal / MM:.3f} mm. "
-        )
-    if approximation.beyond is not None:
-        error = rounded_up(approximation.beyond / UM)
+    if approximation.nominal_error is not None:
+        error = f"{approximation.nominal_error / MM:.3f}"
+        nominal = f"With nominal kinematics the error is up to {error} mm. "
+    if approximation.error_beyond is not None:
+        error = rounded_up(approximation.error_beyond / UM)
         beyond = f" {BEYOND_FACE / MM:g} mm beyond a face the error is up to {error} µm."
     reason = "The calibration identified more than offsets."
     if calibration.only_offsets:
@@ -384,6 +383,6 @@ def write_module_page(
         "others": ", ".join(letters),
         "beyond": beyond,
         "longer_mm": f"{LONGER_TOOL / MM:g}",
-        "longer": rounded_up(approximation.longer / UM),
+        "longer": rounded_up(approximation.error_of_longer_tool / UM),
     }
     return fill_template("kinematics.md", values)

@@ -117,42 +117,44 @@ class Numeral:
 class DecimalSign:
     """Decimal sign of a table, with the evidence."""
 
-    sign: Sign | None
-    """None if the numerals are ambiguous or contradict each other."""
+    sign: Sign
     evidence: Numeral | None
-    """First numeral that determines the sign; None if there is none."""
-    rival: Numeral | None = None
-    """Ambiguous numeral, or numeral with the other sign than the evidence."""
-
-    @property
-    def contradictory(self) -> bool:
-        """True if some numerals have a decimal comma and others a decimal point."""
-        return self.evidence is not None and self.rival is not None
+    """First numeral that determines the sign; None if the sign is stated, or not needed."""
 
 
-def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign:
+@dataclass(frozen=True, slots=True)
+class UnknownSign:
+    """Numerals of a table that contradict each other, or are ambiguous."""
+
+    rival: Numeral
+    """First numeral with the rarer sign, or first ambiguous one."""
+    evidence: Numeral | None
+    """First numeral with the other sign; None if no numeral determines the sign."""
+
+
+def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign | UnknownSign:
     """Infer the common decimal sign of the numerals of a table.
 
     A numeral that is a number with one of the signs only determines the sign of the table. Integers
     have no sign.
     """
-    evidence: dict[Sign, Numeral] = {}
+    evidence: dict[Sign, list[Numeral]] = {}
     ambiguous: Numeral | None = None
     for numeral in numerals:
         point, comma = parse_numeral(numeral.text, "point"), parse_numeral(numeral.text, "comma")
         if point is None and comma is not None:
-            evidence.setdefault("comma", numeral)
+            evidence.setdefault("comma", []).append(numeral)
         elif comma is None and point is not None:
-            evidence.setdefault("point", numeral)
+            evidence.setdefault("point", []).append(numeral)
         elif point != comma and ambiguous is None:
             ambiguous = numeral
     if len(evidence) == 2:
-        return DecimalSign(None, evidence["comma"], evidence["point"])
-    for sign, numeral in evidence.items():
-        return DecimalSign(sign, numeral)
-    if ambiguous is not None:
-        return DecimalSign(None, None, ambiguous)
-    return DecimalSign("point", None)
+        # of equally frequent signs, the second one is the rival
+        frequent, rare = sorted(evidence.values(), key=len, reverse=True)
+        return UnknownSign(rare[0], frequent[0])
+    for sign, same in evidence.items():
+        return DecimalSign(sign, same[0])
+    return DecimalSign("point", None) if ambiguous is None else UnknownSign(ambiguous, None)
 
 
 def parse_typed_reading(text: str, *, largest: float = math.inf) -> float:

@@ -35,6 +35,8 @@ class Layout:
     """Outputs and size of a function, which suffice to run its instructions from disk."""
 
     n_instructions: int
+    widths: Sequence[int]
+    """Number of coordinates of each input."""
     names: Sequence[str]
     """Names of the outputs."""
     shapes: Sequence[tuple[int, int]]
@@ -51,10 +53,10 @@ class BatchFunction:
 
     Args:
         function: Function whose inputs are column vectors, or one that loads it. With a key a
-            large function is loaded only if CasADi evaluates it, because that takes much longer
-            than loading its instructions.
+            large function is loaded only if CasADi evaluates it, because loading it takes much
+            longer than loading its instructions.
         matrices: Names of the outputs that are matrices even if they have one column.
-        sparse: Names of the outputs whose nonzeros are returned, in the order of `pattern`. Other
+        sparse: Names of the outputs whose nonzeros are returned, in the order of `patterns`. Other
             outputs are dense.
         key: Key of the function's layout and instructions on disk; not cached by default.
     """
@@ -90,13 +92,9 @@ class BatchFunction:
             disk_cache.store(key, json.dumps(asdict(layout)).encode())
         return layout
 
-    def pattern(self, name: str) -> tuple[Indices, Indices]:
-        """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
-        return self._patterns[name]
-
     @cached_property
-    def _patterns(self) -> dict[str, tuple[Indices, Indices]]:
-        """Patterns of the sparse outputs as arrays, by name."""
+    def patterns(self) -> dict[str, tuple[Indices, Indices]]:
+        """Rows and columns of the nonzeros of each sparse output, shape (nnz,) each, by name."""
         return {
             name: (np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64))
             for name, (rows, columns) in self.layout.patterns.items()
@@ -113,18 +111,23 @@ class BatchFunction:
             Each output with shape (K, rows, columns). Column vectors that are not `matrices` have
             shape (K, rows), sparse outputs (K, nnz).
         """
-        count = self._count(inputs)
+        arrays = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in inputs]
+        count = self._count(arrays)
         large = count >= MIN_POINTS and self.layout.n_instructions * count >= MIN_OPERATIONS
         fast = large and llvm.is_installed()
-        return self.evaluate(*inputs, backend="llvm" if fast else "casadi")
+        return self.evaluate(*arrays, backend="llvm" if fast else "casadi")
 
     def evaluate(self, *inputs: ArrayLike, backend: Backend) -> tuple[Array, ...]:
         """Evaluate with a stated backend; arguments and result are those of `__call__`.
 
         CasADi evaluates functions with an instruction that the LLVM backend lacks.
+
+        Raises:
+            ValueError: If the inputs do not have the shapes that `__call__` states.
         """
         arrays = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in inputs]
-        count = self._count(inputs)
+        count = self._count(arrays)
+        self._require_shapes(arrays, count)
         nonzeros = None
         if backend == "llvm" and self._program is not None:
             nonzeros = llvm.run(self._program, arrays, count)
@@ -139,10 +142,21 @@ class BatchFunction:
         return tuple(results)
 
     @staticmethod
-    def _count(inputs: Sequence[ArrayLike]) -> int:
-        """Number of points."""
-        counts = [len(a) for a in map(np.asarray, inputs) if a.ndim > 1]
+    def _count(arrays: Sequence[Array]) -> int:
+        """Number of points of inputs with two dimensions."""
+        counts = [len(a) for a in arrays]
         return 0 if 0 in counts else max(counts, default=1)
+
+    def _require_shapes(self, arrays: Sequence[Array], count: int) -> None:
+        """Refuse inputs beyond which the LLVM backend would read memory."""
+        widths = self.layout.widths
+        fit = [a.shape[1:] for a in arrays] == [(n,) for n in widths]
+        if not fit or (count and any(count % len(a) for a in arrays)):
+            shapes = ", ".join(str(a.shape) for a in arrays)
+            raise ValueError(
+                f"found inputs of the shapes {shapes}; expected {', '.join(map(str, widths))} "
+                "columns, and numbers of rows that divide the largest one"
+            )
 
     @cached_property
     def _program(self) -> llvm.Program | None:
@@ -150,8 +164,10 @@ class BatchFunction:
         key = self._key if self.layout.n_instructions >= llvm.MIN_CACHED else None
         sizes = self.layout.n_instructions, len(self.layout.names)
         program = None if key is None else llvm.load_program(key, *sizes)
-        if program is None and (program := llvm.list_instructions(self.function)) and key:
-            llvm.store_program(key, program)
+        if program is None:
+            program = llvm.list_instructions(self.function)
+            if program is not None and key is not None:
+                llvm.store_program(key, program)
         return program
 
     def _run_casadi(self, arrays: Sequence[Array], count: int) -> list[Array]:
@@ -211,6 +227,7 @@ def _lay_out(function: ca.Function, *, sparse: Sequence[str]) -> Layout:
     patterns = {name: function.sparsity_out(name).get_triplet() for name in sparse}
     return Layout(
         n_instructions=int(function.n_instructions()),
+        widths=[function.nnz_in(i) for i in range(function.n_in())],
         names=names,
         shapes=[
             (function.nnz_out(name), 1) if name in sparse else function.size_out(name)

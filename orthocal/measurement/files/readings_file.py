@@ -25,6 +25,7 @@ from orthocal.io.tables.numerals import (
     DecimalSign,
     Numeral,
     Sign,
+    UnknownSign,
     format_decimal,
     infer_decimal_sign,
     parse_numeral,
@@ -166,28 +167,40 @@ def decide_decimal_sign(
     Raises:
         SessionError: If both signs are possible, or both occur.
     """
-    sign = infer_decimal_sign(cells)
-    if sign.sign is not None:
-        return sign
-    if sign.rival is not None and sign.evidence is not None:
+    inferred = infer_decimal_sign(cells)
+    ambiguous = [c for c in cells if _is_ambiguous(c.text)]
+    if standard:
+        points = [c for c in ambiguous if "," not in c.text]
+        ambiguous = [c for c in ambiguous if "," in c.text]
+        if isinstance(inferred, DecimalSign) and inferred.sign == "comma" and points:
+            commas = [c for c in cells if _requires_comma(c.text)]
+            rare, frequent = sorted((points, commas), key=len)
+            inferred = UnknownSign(rare[0], frequent[0])
+    if isinstance(inferred, DecimalSign):
+        return inferred
+    if inferred.evidence is not None:
+        rival, other = inferred.rival, inferred.evidence
+        signs = ("point", "comma") if _requires_comma(other.text) else ("comma", "point")
         raise SessionError(
-            f"the reading '{shorten(sign.rival.text)}' has a decimal point, and "
-            f"'{shorten(sign.evidence.text)}' in line {sign.evidence.line} a decimal comma; "
-            "use one decimal sign",
-            where=place(sign.rival.line),
+            f"the reading '{shorten(rival.text)}' has a decimal {signs[0]}, and "
+            f"'{shorten(other.text)}' in line {other.line} a decimal {signs[1]}; use one decimal "
+            "sign",
+            where=place(rival.line),
         )
-    ambiguous_cells = (
-        c for c in cells if _is_ambiguous(c.text) and not (standard and "," not in c.text)
-    )
-    ambiguous = next(ambiguous_cells, None)
-    if ambiguous is None:
+    if not ambiguous:
         return DecimalSign("point", None)
-    comma, point = parse_numeral(ambiguous.text, "comma"), parse_numeral(ambiguous.text, "point")
+    text = ambiguous[0].text
+    comma, point = parse_numeral(text, "comma"), parse_numeral(text, "point")
     raise SessionError(
-        f"the reading '{ambiguous.text}' is {format_decimal(comma)} with a decimal comma and "
+        f"the reading '{text}' is {format_decimal(comma)} with a decimal comma and "
         f"{format_decimal(point)} with a decimal point, and no other reading decides; {advice}",
-        where=place(ambiguous.line),
+        where=place(ambiguous[0].line),
     )
+
+
+def _requires_comma(text: str) -> bool:
+    """True for a numeral that is a number with a decimal comma only."""
+    return parse_numeral(text, "point") is None and parse_numeral(text, "comma") is not None
 
 
 def _is_ambiguous(text: str) -> bool:
@@ -220,7 +233,7 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
         if decoded.encoding != "utf-8":
             content = decoded.text.encode()
         return _standard_rows(path, content)
-    table = _read_spreadsheet_table(path, content)
+    table = _read_spreadsheet_table(path, content, decoded.text)
     return _standard_rows(path, content) if table is None else _spreadsheet_rows(*table)
 
 
@@ -240,7 +253,7 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             most=MOST_CSV_ROWS,
         )
 
-    sign: Sign | None = None
+    sign: Sign = "point"
     if not content.isascii() or b'"' in content or b";" in content:
         numerals = []
         with suppress(SessionError):  # a wrong row is refused when it is read below
@@ -249,63 +262,77 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
                 numerals += [Numeral(row[name], line) for name in names if row.get(name)]
         sign = _standard_decimal_sign(numerals, path)
     for line, cells in rows():
-        if sign is not None:
-            cells |= {name: _with_decimal_point(cells.get(name, ""), sign) for name in NUMBERS}
+        cells |= {n: _standard_number(text, sign) for n, text in cells.items() if n in NUMBERS}
         yield RawReading(f"{path}:{line}", line, **cells)
 
 
 SIGN_ADVICE = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
 
 
-def _standard_decimal_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
+def _standard_decimal_sign(cells: Sequence[Numeral], path: Path) -> Sign:
     """Decimal sign of a table with standard headings, where a point is always a decimal point."""
-    if not any("," in cell.text for cell in cells) or infer_decimal_sign(cells).contradictory:
+    if not any("," in cell.text for cell in cells):
         return "point"
     return decide_decimal_sign(
         cells, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
     ).sign
 
 
-def _with_decimal_point(text: str, sign: Sign) -> str:
-    """Number with a decimal point; other text is returned unchanged and refused later."""
-    if sign == "point":
+def _standard_number(text: str, sign: Sign) -> str:
+    """Number of a table with standard headings, with a decimal point.
+
+    Other text is returned unchanged and refused later.
+    """
+    if sign == "point" or "," not in text:
         return plain_minus(text)
     value = parse_numeral(text, sign)
     return text if value is None else format_mm(value)
 
 
-def _read_spreadsheet_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
+def _read_spreadsheet_table(path: Path, content: bytes, text: str) -> tuple[Table, Columns] | None:
     """Table that a spreadsheet program saved; None for other files.
 
-    Text above the headings is not accepted.
+    Lines above the headings are not accepted, except one that states the separator.
+
+    Args:
+        path: The file, for messages.
+        content: Content of the file.
+        text: Its decoded text.
 
     Raises:
-        SessionError: If a column does not belong to a session.
+        SessionError: If a column does not belong to a session, or its readings are not in mm.
     """
     from orthocal.io.tables.table import read_table
     from orthocal.measurement.importing.headings import EXPECTED, choose_columns, find_header
 
     try:
         table = read_table(path, content, find_header, expected=EXPECTED)
-        columns = choose_columns(table.header, {}, where=f"{path}:{table.header_line}")
     except SessionError:
         return None
-    is_first = (
-        table.header_line == 1 or stated_separator(decode(content, where="").text) is not None
-    )
-    if table.above or not is_first:
+    header_is_first = table.header_line == 1 or stated_separator(text) is not None
+    if table.above or not header_is_first or len(set(table.header)) < len(table.header):
         return None
-    unknown = [
-        *columns.extra,
-        *(i for i, h in columns.readings.items() if h.unit != "mm" or h.cycle is not None),
-    ]
-    if unknown:
-        name = " ".join(table.header[min(unknown)].split())
+    where = f"{path}:{table.header_line}"
+    try:
+        columns = choose_columns(table.header, {}, where=where)
+    except SessionError as e:
+        raise SessionError(f"{e.problem} of `orthocal import`", where=where) from None
+    names = [shorten(" ".join(name.split())) for name in table.header]
+    if columns.extra:
         raise SessionError(
-            f"unknown column '{shorten(name)}'; expected {', '.join(REQUIRED)} and optionally "
-            f"{', '.join(OPTIONAL)}",
-            where=f"{path}:{table.header_line}",
+            f"unknown column '{names[columns.extra[0]]}'; expected {', '.join(REQUIRED)} and "
+            f"optionally {', '.join(OPTIONAL)}",
+            where=where,
         )
+    for i, heading in columns.readings.items():
+        if heading.cycle is not None or heading.unit != "mm":
+            unit = f"readings in {heading.unit}" if heading.unit else "readings without a unit"
+            noun = unit if heading.cycle is None else f"cycle {heading.cycle} alone"
+            raise SessionError(
+                f"column '{names[i]}' contains {noun}; expected one column of readings in mm, "
+                "which `orthocal import` makes of such a table",
+                where=where,
+            )
     return table, columns
 
 
@@ -314,18 +341,16 @@ def _spreadsheet_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
     require_unsplit_numbers(table, columns)
     (reading,) = columns.readings
     numerals = [Numeral(row.cell(reading).text, row.line) for row in table.rows]
+    standard = has_standard_headings(table.header)
     sign = decide_decimal_sign(
-        numerals,
-        standard=has_standard_headings(table.header),
-        advice=SIGN_ADVICE,
-        place=table.place,
+        numerals, standard=standard, advice=SIGN_ADVICE, place=table.place
     ).sign
     width = len(table.header)
     for row in table.rows:
         where = table.place(row.line)
         if len(row.cells) > width or row.width < width:
             names = SEPARATORS[table.separator or "comma"].join(table.header)
-            count = max(len(row.cells), row.width if row.width < width else 0)
+            count = row.width if row.width < width else len(row.cells)
             raise SessionError(
                 f"has {count} fields; expected {width} ({shorten(names)})", where=where
             )
@@ -334,7 +359,8 @@ def _spreadsheet_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
             for role, index in (*columns.single.items(), ("reading", reading))
         }
         for name in NUMBERS:
-            value = None if sign is None else parse_numeral(cells.get(name, ""), sign)
+            text = cells.get(name, "")
+            value = parse_numeral(text, "point" if standard and "," not in text else sign)
             if value is not None:
                 cells[name] = format_mm(value)
         yield RawReading(where, row.line, **cells)
@@ -382,9 +408,11 @@ def require_unsplit_numbers(
     readings = list(columns.readings)
     texts = [row.cell(i).text for row in table.rows for i in readings]
     separator_known = separator_known or has_standard_headings(table.header)
+    # a decimal sign within a cell shows that decimal commas do not separate cells
     sign_known = separator_known or any("." in t or "," in t for t in texts)
-    pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
-    pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}
+    pairs = {(i, i + 1) for i in readings}
+    pairs |= {(i - 1, i) for i in readings if i and i - 1 not in columns.keys}
+    # every row may contain commas between thousands, and none shows that they separate cells
     grouped = not separator_known and all(_may_be_split_thousands(row, pairs) for row in table.rows)
     for row in table.rows:
         if row.width > table.header_width:
@@ -395,6 +423,7 @@ def require_unsplit_numbers(
             )
         for first, second in sorted(pairs):
             a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
+            # these two cells may be one number such as 1,000, in the table or at the end of its row
             thousands = grouped or (
                 not separator_known and _may_end_in_split_thousands(row, first, second)
             )

@@ -15,6 +15,7 @@ from orthocal.arguments import require_kind
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.effects.compensation import compensates_alike, format_table, table_name
 from orthocal.errors import SessionError
+from orthocal.io.documents import validate
 from orthocal.io.files import exists, write_file, write_files
 from orthocal.measurement.files.point_rows import (
     is_of_row,
@@ -28,6 +29,7 @@ from orthocal.measurement.files.readings_file import (
     RawReading,
     format_readings,
 )
+from orthocal.measurement.files.session_keys import SessionKeys
 from orthocal.observation.conditions import needed_conditions
 from orthocal.observation.contacts import balls_aligned_elsewhere
 from orthocal.printers.settings import DeltaSettings
@@ -238,10 +240,12 @@ def write_session(
 
     Raises:
         OrthocalError: If the directory is not writable.
+        SessionError: If a name is not possible in a file.
     """
     require_kind(session, Session, expected="a Session, such as load_session(...)")
     folder = Path(folder)
     document = session_document(session)
+    validate(SessionKeys, document, where=str(folder / "session.yaml"), error=SessionError)
     document["robot"] = _place_robot(session, folder)
     if session.offsets_from is not None:
         entered = os.path.relpath(session.offsets_from.resolve(), folder.resolve())

@@ -61,6 +61,9 @@ REQUIRED_NAMES: tuple[Role, ...] = ("setup", "posture")
 SkippedRows = list[tuple[int, str]]
 """Lines of the table that are not imported, with the reason."""
 
+NamesByFold = Mapping[str, Sequence[str]]
+"""Names in the session by folded name."""
+
 SIGN_ADVICE = "choose one by --decimal comma or --decimal point"
 
 SAME_POINT_MM = 0.1
@@ -77,18 +80,18 @@ _NUMBER_AND_WORD = re.compile(r"(.*[0-9.,])\s*([^0-9.,\s].*)", re.S)
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class LengthCell:
     """Cell of a column of readings or coordinates."""
 
     row: RawReading
     """The row with names as in the table, without its reading."""
     column: int
+    role: Role
     number: str | None
     """Text of the number without its unit; None if the cell has no reading."""
     value: Decimal | None = None
     """Value of the number in a workbook; None for text."""
     unit: UnitName | None = None
-    role: Role = "reading"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,22 +143,22 @@ def make_long_table(
     require_unsplit_numbers(table, columns, separator_known=separator_known or decimal == "point")
     skipped: SkippedRows = []
     first_setup = next(iter(names["setup"]))
-    entries = list(_read_entries(table, columns, skipped, fill, first_setup))
-    sign = _decide_decimal_sign(table, entries, decimal)
-    setups, postures = (_folded_names(names[role]) for role in REQUIRED_NAMES)
+    lengths = list(_read_lengths(table, columns, skipped, fill, first_setup))
+    sign = _decide_decimal_sign(table, lengths, decimal)
+    setups, postures = (_names_by_fold(names[role]) for role in REQUIRED_NAMES)
     rows = _Rows(setups, postures, skipped)
-    for entry in entries:
-        if entry.number is None:
-            rows.skip(entry)
+    for length in lengths:
+        if length.number is None:
+            rows.skip(length)
             continue
-        value = _parse_value(entry, sign.sign)
-        rows.add(entry, value, _choose_unit(entry, unit, table.header[entry.column]))
+        value = _parse_value(length, sign.sign)
+        rows.add(length, value, _choose_unit(length, unit, table.header[length.column]))
     return LongTable(
         rows=rows.located(points or {}),
-        missing=tuple(r for r in rows.missing if (r.line, r.cycle) not in rows.read),
+        missing=tuple(r for r in rows.missing if (r.line, r.cycle) not in rows.by_place),
         decimal=sign,
         units=tuple(rows.units),
-        unit_assumed=any(e.number is not None and e.unit is None for e in entries),
+        unit_assumed=any(c.number is not None and c.unit is None for c in lengths),
         skipped=tuple(skipped),
         renamed=tuple(rows.renamed.items()),
     )
@@ -165,12 +168,12 @@ def make_long_table(
 class _Rows:
     """Accumulator of the rows of a long table; a point has several cells."""
 
-    setups: Mapping[str, str]
-    """Setups of the session by folded name."""
-    postures: Mapping[str, str]
-    """Postures of the session by folded name."""
+    setups: NamesByFold
+    """Setups of the session."""
+    postures: NamesByFold
+    """Postures of the session."""
     skipped: SkippedRows
-    read: dict[tuple[int, str], RawReading] = field(default_factory=dict)
+    by_place: dict[tuple[int, str], RawReading] = field(default_factory=dict)
     """Rows by line and cycle."""
     missing: list[RawReading] = field(default_factory=list)
     commanded: dict[int, dict[Role, Decimal]] = field(default_factory=dict)
@@ -178,28 +181,28 @@ class _Rows:
     units: dict[UnitName, None] = field(default_factory=dict)
     renamed: dict[str, str] = field(default_factory=dict)
 
-    def skip(self, entry: Entry) -> None:
+    def skip(self, length: LengthCell) -> None:
         """Record an empty cell."""
-        row = _with_session_names(entry.row, self.setups, self.postures)
-        if row.setup in self.setups and row.posture in self.postures:
+        row = _with_session_names(length.row, self.setups, self.postures)
+        if _is_known(row.setup, self.setups) and _is_known(row.posture, self.postures):
             self.missing.append(row)
         elif (row.line, NO_READING) not in self.skipped[-1:]:
             self.skipped.append((row.line, NO_READING))
 
-    def add(self, entry: Entry, value: Decimal, unit: UnitName) -> None:
+    def add(self, length: LengthCell, value: Decimal, unit: UnitName) -> None:
         """Record a number."""
-        row = _with_session_names(entry.row, self.setups, self.postures)
-        names = zip(_names(entry.row), _names(row), strict=True)
+        row = _with_session_names(length.row, self.setups, self.postures)
+        names = zip(_names(length.row), _names(row), strict=True)
         self.renamed |= {old: new for old, new in names if old != new}
         self.units[unit] = None
         with localcontext(prec=2 * LONGEST_NUMBER):
             value *= UNITS[unit]
-        if entry.role in NOMINAL:
-            self.commanded.setdefault(row.line, {})[entry.role] = value
+        if length.role in NOMINAL:
+            self.commanded.setdefault(row.line, {})[length.role] = value
             return
         key = row.line, row.cycle
-        cell: dict[str, Any] = {f"{entry.role}_mm": format_mm(value)}
-        self.read[key] = replace(self.read.get(key, row), **cell)
+        cell: dict[str, Any] = {f"{length.role}_mm": format_mm(value)}
+        self.by_place[key] = replace(self.by_place.get(key, row), **cell)
 
     def located(self, points: Mapping[str, Array]) -> tuple[RawReading, ...]:
         """Rows in which commanded points are replaced by their postures.
@@ -211,7 +214,7 @@ class _Rows:
             replace(row, posture=_find_posture(self.commanded[row.line], points, row.where))
             if row.line in self.commanded
             else row
-            for row in self.read.values()
+            for row in self.by_place.values()
         )
 
 
@@ -265,9 +268,7 @@ def _names(row: RawReading) -> tuple[str, str, str]:
     return row.setup, row.posture, row.minus
 
 
-def _with_session_names(
-    row: RawReading, setups: Mapping[str, str], postures: Mapping[str, str]
-) -> RawReading:
+def _with_session_names(row: RawReading, setups: NamesByFold, postures: NamesByFold) -> RawReading:
     """Row with the names in the session instead of those in the table."""
     return replace(
         row,
@@ -277,9 +278,9 @@ def _with_session_names(
     )
 
 
-def _read_entries(
+def _read_lengths(
     table: Table, columns: Columns, skipped: SkippedRows, fill: bool, setup: str
-) -> Iterator[Entry]:
+) -> Iterator[LengthCell]:
     """Cells of the columns of readings and points, row by row.
 
     Args:
@@ -309,22 +310,26 @@ def _read_entries(
         filled_cells = [i for i in measured if not _is_missing(row.cell(i))]
         unheaded = sum(not c.is_blank for c in row.cells[len(table.header) :])
         if unheaded:
-            skipped.append((row.line, f"{unheaded} cells without a heading"))
+            cells = "1 cell" if unheaded == 1 else f"{unheaded} cells"
+            skipped.append((row.line, f"{cells} without a heading"))
         complete = all(names[role] for role in name_roles)
         if fill:  # also from a row that states a name only
             names = above = {role: name or above[role] for role, name in names.items()}
+        # a row without a reading is skipped unless it states all names itself
         if not filled_cells and not complete:
             skipped.append((row.line, NO_READING))
             continue
         _require_names(table, row, names, name_roles)
-        cells = _read_optional_cells(table, row, columns) | names
+        optional = _read_optional_cells(table, row, columns) | names
         for i, heading in _length_columns(columns, filled_cells).items():
             where = table.place(row.line, i)
-            numbered = cells if heading.cycle is None else {**cells, "cycle": str(heading.cycle)}
-            entry = Entry(RawReading(where, row.line, **numbered), i, None, role=heading.role)
+            cycle = {} if heading.cycle is None else {"cycle": str(heading.cycle)}
+            length = LengthCell(
+                RawReading(where, row.line, **{**optional, **cycle}), i, heading.role, None
+            )
             if _is_missing(row.cell(i)):
                 if heading.role not in NOMINAL:
-                    yield entry
+                    yield length
                 continue
             number, value, unit = _read_number(row.cell(i), where)
             stated = heading.unit or units_below.get(i)
@@ -332,7 +337,7 @@ def _read_entries(
                 raise SessionError(
                     f"the reading is in {unit}, and its heading says {stated}", where=where
                 )
-            yield replace(entry, number=number, value=value, unit=unit or stated)
+            yield replace(length, number=number, value=value, unit=unit or stated)
 
 
 def _without_units_row(
@@ -340,19 +345,20 @@ def _without_units_row(
 ) -> tuple[Iterable[Row], dict[int, UnitName]]:
     """Rows below the headings without a row of units, and these units by column."""
     rows = table.fill_merged(columns.single.values())
-    for first in rows:
-        units = _read_units_row(first, columns)
-        if not units:
-            return chain([first], rows), {}
-        skipped.append((first.line, "units"))
-        return rows, units
-    return rows, {}
+    first = next(rows, None)
+    if first is None:
+        return rows, {}
+    units = _read_units_row(first, columns)
+    if not units:
+        return chain([first], rows), {}
+    skipped.append((first.line, "units"))
+    return rows, units
 
 
 def _length_columns(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:
     """Columns of lengths that belong to a row: those of its point, or of its readings.
 
-    A reading beside a point remains, so that the row is refused.
+    A reading beside a point remains. The session then refuses the row of the point.
 
     Args:
         columns: Roles of the columns.
@@ -388,9 +394,10 @@ def _read_temperature(table: Table, row: Row, column: int) -> str:
     Raises:
         SessionError: If the temperature may be in °C or °F.
     """
-    text = _name(row.cell(column))
+    cell = row.cell(column)
+    text = _name(cell)
     number, unit = split_degrees(text)
-    degrees = unit or split_degrees(table.header[column])[1]
+    degrees = unit or split_degrees(cell.unit)[1] or split_degrees(table.header[column])[1]
     value = parse_numeral(number.strip(), "comma" if "," in number else "point")
     if value is None or value.adjusted() > 3:
         return text
@@ -471,11 +478,13 @@ def _read_number(cell: Cell, where: str) -> tuple[str, Decimal | None, UnitName 
     return (match[1], None, unit) if match and unit else (text, None, None)
 
 
-def _decide_decimal_sign(table: Table, entries: list[Entry], stated: Sign | None) -> DecimalSign:
+def _decide_decimal_sign(
+    table: Table, lengths: list[LengthCell], stated: Sign | None
+) -> DecimalSign:
     if stated is not None:
         return DecimalSign(stated, None)
     numerals = [
-        Numeral(e.number, e.row.line) for e in entries if e.number is not None and e.value is None
+        Numeral(c.number, c.row.line) for c in lengths if c.number is not None and c.value is None
     ]
     return decide_decimal_sign(
         numerals,
@@ -485,30 +494,30 @@ def _decide_decimal_sign(table: Table, entries: list[Entry], stated: Sign | None
     )
 
 
-def _parse_value(entry: Entry, sign: Sign | None) -> Decimal:
+def _parse_value(length: LengthCell, sign: Sign) -> Decimal:
     """Number of a cell in the cell's unit."""
-    if entry.value is not None:
-        return entry.value
-    number = entry.number or ""
-    value = parse_numeral(number, sign or "point")
+    if length.value is not None:
+        return length.value
+    number = length.number or ""
+    value = parse_numeral(number, sign)
     if value is None:
         hint = ""
         if any(parse_numeral(number, s) is not None for s in ("point", "comma")):
             hint = f" with a decimal {sign}"
         raise SessionError(
-            f"the reading is '{shorten(number)}'; expected a number{hint}", where=entry.row.where
+            f"the reading is '{shorten(number)}'; expected a number{hint}", where=length.row.where
         )
     return value
 
 
-def _choose_unit(entry: Entry, stated: UnitName | None, heading: str) -> UnitName:
+def _choose_unit(length: LengthCell, stated: UnitName | None, heading: str) -> UnitName:
     """Unit of a cell or its heading, or the unit of the option `--unit`."""
-    where = entry.row.where
-    if stated and entry.unit and stated != entry.unit:
+    where = length.row.where
+    if stated and length.unit and stated != length.unit:
         raise SessionError(
-            f"the reading is in {entry.unit}, which contradicts --unit {stated}", where=where
+            f"the reading is in {length.unit}, which contradicts --unit {stated}", where=where
         )
-    unit = entry.unit or stated
+    unit = length.unit or stated
     if unit is None:
         raise SessionError(
             f"neither the heading '{shorten(' '.join(heading.split()))}' nor the cell has a unit; "
@@ -525,15 +534,24 @@ def _fold(name: str) -> str:
     return "_".join(plain_minus(composed(name)).casefold().split())
 
 
-def _folded_names(names: Iterable[str]) -> dict[str, str]:
-    """Names in the session by exact name and, if unique, by folded name."""
+def _names_by_fold(names: Iterable[str]) -> dict[str, list[str]]:
+    """Names in the session by folded name."""
     by_fold: dict[str, list[str]] = {}
     for name in names:
         by_fold.setdefault(_fold(name), []).append(name)
-    unique = {fold: same[0] for fold, same in by_fold.items() if len(same) == 1}
-    return unique | {name: name for same in by_fold.values() for name in same}
+    return by_fold
 
 
-def _session_name(written: str, folded_names: Mapping[str, str]) -> str:
-    """Name in the session for a name in the table; the name in the table if there is none."""
-    return folded_names.get(written) or folded_names.get(_fold(written)) or written
+def _is_known(name: str, by_fold: NamesByFold) -> bool:
+    """True for a name in the session."""
+    return name in by_fold.get(_fold(name), ())
+
+
+def _session_name(written: str, by_fold: NamesByFold) -> str:
+    """Name in the session for a name in the table.
+
+    The name in the table is returned if no name or several names differ from it in case and blanks
+    only.
+    """
+    same = by_fold.get(_fold(written), ())
+    return same[0] if len(same) == 1 else written

@@ -191,12 +191,11 @@ def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:
         approach: A letter for each drive.
     """
     start = drives - approach_steps(robot, approach)
-    names = [""] * len(drives)
-    beyond_travel = find_beyond_travel(robot, start, names)
+    beyond_travel = find_beyond_travel(robot, start)
     possible = np.ones(len(drives), dtype=np.bool_)
     possible[list(beyond_travel)] = False
     failures = Failures()
     inside = np.flatnonzero(possible)
-    nominal_closure(robot).close(start[inside], names=[""] * inside.size, failures=failures)
+    nominal_closure(robot).close(start[inside], failures=failures)
     possible[inside[list(failures)]] = False
     return possible

@@ -666,7 +666,7 @@ def _sample_paths(robot: Robot, polylines: Sequence[Sequence[Array]]) -> list[_P
         last = first + len(part)
         path = _Path(part, drives[first:last], passive[first:last])
         reached = failures.keys().isdisjoint(range(first, last))
-        if reached and find_beyond_travel(robot, path.drives, [""] * len(part)):
+        if reached and find_beyond_travel(robot, path.drives):
             reached = False
         paths.append(path if reached else None)
         first = last
