@@ -36,7 +36,6 @@ from orthocal.output.report.figure import (
     scale_log,
     shade,
 )
-from orthocal.output.text.layout import short_name
 from orthocal.units import MM, UM
 
 _deviation, _residual, _prediction_error = map(
@@ -85,7 +84,7 @@ def plot_setups(calibration: Calibration) -> Figure:
     title = "Residuals per setup, the worst first"
     if len(names) < len(groups):
         title = f"Residuals per setup: the {len(names)} worst of {len(groups)}"
-    figure, axes = open_list(title, [short_name(n) for n in names], height=2.0 * ROW_HEIGHT)
+    figure, axes = open_list(title, names, height=2.0 * ROW_HEIGHT)
     y = np.arange(len(names))
     shown = []
     for get, shift, label, look in (
@@ -165,7 +164,7 @@ def _row_noun(calibration: Calibration) -> str:
 def _row_names(calibration: Calibration, rows: Sequence[ResidualRow]) -> list[str]:
     """Names of rows: setup, postures, and the cycle if there are several cycles."""
     repeated = any(r.cycle != 1 for r in calibration.residuals)
-    return [short_name(f"{r.label}, cycle {r.cycle}" if repeated else r.label) for r in rows]
+    return [f"{r.label}, cycle {r.cycle}" if repeated else r.label for r in rows]
 
 
 def _thin(count: int) -> NDArray[np.int64]:

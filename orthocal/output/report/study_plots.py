@@ -17,6 +17,8 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BAND,
     BEFORE,
+    CHARACTER,
+    MAX_NAME_IN_MATRIX,
     PREDICTED,
     Look,
     Plot,
@@ -27,6 +29,7 @@ from orthocal.output.report.figure import (
     plot,
     scale_log,
 )
+from orthocal.output.text.layout import short_names, true_minus
 from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.study.bootstrap import BootstrapSummary
@@ -138,17 +141,18 @@ def plot_sensitivity(s: SensitivitySummary) -> Figure:
     largest = max(float(np.abs(values).max()), 1e-9)
     decades = 10.0 ** np.arange(math.floor(math.log10(largest)) - 1, math.ceil(math.log10(largest)))
     title = f"Change by one prior standard deviation of each error [µm], {number} errors"
-    figure = open_figure(1.6 + 0.16 * len(s.rows), title, legend=False)
+    columns = short_names([s.parameters[i] for i in chosen], MAX_NAME_IN_MATRIX)
+    below = CHARACTER * max(map(len, columns))
+    figure = open_figure(0.2 + 0.16 * len(s.rows) + below, title, legend=False)
     axes = figure.subplots()
     norm = SymLogNorm(linthresh=decades[0], vmin=-largest, vmax=largest)
     look: dict[str, Any] = {"aspect": "auto", "cmap": "RdBu_r", "interpolation": "nearest"}
     image = axes.imshow(values, norm=norm, **look)
-    rows = [f"{posture}  {output}" for posture, output in s.rows]
+    rows = short_names([f"{posture}  {output}" for posture, output in s.rows])
     axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
-    columns = [s.parameters[i] for i in chosen]
     axes.set_xticks(range(len(columns)), columns, fontsize=6.5, rotation=90)
     ticks = FixedLocator([*-decades[::-1], 0.0, *decades])
-    text = FuncFormatter(lambda v, _: f"{v:+g}" if v else "0")
+    text = FuncFormatter(lambda v, _: true_minus(f"{v:+g}") if v else "0")
     bar = figure.colorbar(image, ax=axes, fraction=0.04, ticks=ticks, format=text)
     bar.minorticks_off()
     return figure

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import matplotlib
@@ -15,9 +16,11 @@ from scipy import stats
 
 from orthocal import Choice, calibrate, load_session
 from orthocal.output.report import figure as style
-from orthocal.output.report import parameter_plots, reading_plots
+from orthocal.output.report import parameter_plots, reading_plots, study_plots
 from orthocal.output.text import layout
 from orthocal.output.text.tables import render_readings
+from orthocal.study.bootstrap import BootstrapSummary, Scatter
+from orthocal.study.sensitivity import SensitivitySummary
 from orthocal.units import MM
 
 PLOTS = (
@@ -205,6 +208,24 @@ def test_names_from_files_are_shown_unchanged(table1):
     assert long == "n" * 22 + "…" + "n" * 21
     assert set(names) <= set(texts(parameter_plots.plot_parameters(strange)))
     assert set(names) <= set(texts(parameter_plots.plot_correlations(strange)))
+
+
+def test_long_names_remain_distinct_and_leave_space_for_the_plot(table1):
+    long = "left_front_upper_arm_parallelogram_bar_link_{}".format
+    parameters = tuple(replace(p, name=long(p.name)) for p in table1.parameters)
+    matrix = parameter_plots.plot_correlations.figure(replace(table1, parameters=parameters))
+    assert len(set(row_names(matrix.axes[0]))) == 2
+    names, rows = tuple(map(long, range(6))), tuple((long(i), "yx") for i in range(12))
+    changes = np.ones((12, 6)) * MM
+    summary = SensitivitySummary(rows, names, ("mm/mm",) * 6, changes, changes)
+    figure = study_plots.plot_sensitivity.figure(summary)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert len({t.get_text() for t in axes.get_xticklabels()}) == 6
+    assert axes.get_position().height * figure.get_figheight() > 12 * 0.1  # rows of readable names
+    scatter = [Scatter(SimpleNamespace(name=n), *[MM] * 7) for n in names]
+    figure = study_plots.plot_bootstrap.figure(BootstrapSummary(10, MM, tuple(scatter), None))
+    assert max(map(len, row_names(figure.axes[0]))) == layout.LONGEST_NAME
 
 
 def test_residuals_are_listed_before_and_after_the_worst_first(table1):
