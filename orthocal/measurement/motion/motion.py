@@ -76,10 +76,18 @@ class Guidance:
     aligned_at: dict[str, str]
     """Alignment postures by setup."""
 
-    def touched(self, setup: str, posture: str) -> Array:
-        """Contact point of a setup's gauge in a posture, shape (3,), [m]."""
+    def contact_point(self, setup: str) -> tuple[Array, str]:
+        """Contact point in the alignment posture, from the tool centre point in that posture.
+
+        Returns:
+            The point in the axes of the world, shape (3,), [m]; and the origin in words.
+        """
         postures, contact = self.contacts[setup]
-        return np.asarray(contact.points[postures.index(posture)])
+        aligned = self.aligned_at[setup]
+        point = np.asarray(contact.points[postures.index(aligned)])
+        if aligned not in self.tool:
+            return point, "the origin of the machine's model"
+        return point - self.tool[aligned], "the tool centre point"
 
 
 def guide(session: Session) -> Guidance:

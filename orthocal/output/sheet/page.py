@@ -288,7 +288,7 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
     side = name_direction(gauge.contact.direction)
     opposite = name_direction(-gauge.contact.direction)
     place = " ".join(
-        f"{letter}{_number(v / MM, 1)}" for letter, v in zip("XYZ", gauge.point, strict=True)
+        f"{letter}{_number(v / MM, 1)}" for letter, v in zip("XYZ", gauge.coordinates, strict=True)
     )
     contact = ""
     if gauge.rod is not None and gauge.leg is not None:
@@ -311,8 +311,8 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         target = " ".join(gauge.setup.sensor.place).strip()
     return (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
-        f"{opposite}. {contact}In coordinates, from the tool centre point of the machine at its "
-        f"mechanical zero, the contact point is at {place} mm.",
+        f"{opposite}. {contact}In coordinates, from {gauge.origin_name} in this posture, "
+        f"the contact point is at {place} mm.",
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "enter every reading of this setup with the opposite sign.",
     )

@@ -291,8 +291,9 @@ class RecordingText:
         if distances:
             at = f"{distances[aligned] / MM:.1f} mm from the hinge on the slide"
         else:
-            point = ", ".join(format_fixed(v / MM, 1) for v in guidance.touched(setup, aligned))
-            at = f"at ({point}) mm from the tool centre point at the mechanical zero"
+            point, origin = guidance.contact_point(setup)
+            place = ", ".join(format_fixed(v / MM, 1) for v in point)
+            at = f"at ({place}) mm from {origin}"
         return (
             f"Stand: on the {side} side, so that the tip in posture {aligned} touches {at}. Push "
             "the plunger in: the reading must grow. If it falls, enter every reading of this setup "
