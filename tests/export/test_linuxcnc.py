@@ -338,7 +338,8 @@ def test_larger_tolerance_gives_a_lower_degree(full, exported):
 
 
 def test_rounded_up():
-    assert [rounded_up(v) for v in (0.02801, 0.028, 12.1, 1.0)] == ["0.029", "0.028", "13", "1"]
+    values = (0.02801, 0.028, 12.1, 1.0, 99.9, 1234.0)
+    assert [rounded_up(v) for v in values] == ["0.029", "0.028", "13", "1", "100", "1300"]
 
 
 @pytest.mark.parametrize(

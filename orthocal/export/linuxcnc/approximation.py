@@ -175,7 +175,7 @@ def rounded_up(value: float) -> str:
     if not math.isfinite(value) or value <= 0.0:
         return f"{value:g}"
     decimals = 1 - math.floor(math.log10(value))
-    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.2g}"
+    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:g}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,7 @@ from scipy import special
 
 from orthocal.arrays import Array
 from orthocal.assessment.circular_deviation import Circle
+from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.residual_rows import (
     ResidualRow,
@@ -191,7 +192,7 @@ def plot_circle(circle: Circle) -> Figure:
     few = len(circle.angles) <= 72
     for label, values, g, colour, mark in looks:
         radii = np.append(values, values[0]) / UM
-        text = f"{label}: G = {g / UM:.3g} µm"
+        text = f"{label}: G = {um(g)} µm"
         axes.plot(
             closed, radii, mark if few else "-", color=colour, label=text, markersize=3.0, lw=1.0
         )

@@ -18,6 +18,7 @@ from scipy.interpolate import RectBivariateSpline
 from orthocal.arrays import Array
 from orthocal.assessment.assess import changes_offsets
 from orthocal.assessment.tool_error import ToolAccuracy
+from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
 from orthocal.units import MM, UM
@@ -200,7 +201,7 @@ def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, cover
     inside = levels[(levels > size.min()) & (levels < size.max())]
     if _is_constant(size):
         ink = _ink(levels, float(size.mean()))
-        text = f"{size.mean():.3g} µm everywhere"
+        text = f"{um(size.mean() * UM)} µm everywhere"
         axes.text(x.mean(), y.mean(), text, color=ink, horizontalalignment="center")
     elif inside.size:
         inks = [_ink(levels, value) for value in inside]
