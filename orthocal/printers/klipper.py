@@ -199,7 +199,11 @@ def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
             "of heights, distances and parameters as Klipper writes them",
             where=line,
         ) from None
-    return _log_from_steps(pairs, [], distances, settings, steps, line)
+    # heights of the probe follow the manual ones, and all are its z_offset
+    manual, probed = (
+        [p for p in pairs if (p[0] == pairs[-1][0]) is last] for last in (False, True)
+    )
+    return _log_from_steps(probed, manual, distances, settings, steps, line)
 
 
 def _log_from_steps(
@@ -220,10 +224,12 @@ def _log_from_steps(
         steps: Travel of each carriage per step, shape (3,), [m].
         where: File and line, for messages.
     """
-    notes = []
+    notes, height = list[str](), settings.probe[2]
+    if height and pairs and not pairs[-1][0]:  # METHOD=manual: the nozzle touched the bed
+        settings = replace(settings, probe=(0.0, 0.0, height))
     if manual and any(settings.probe[:2]):
         notes.append(
-            f"{len(manual)} manual heights are not used: the probe is at another place than the "
+            f"Manual heights are not used ({len(manual)}): the probe is at another place than the "
             "nozzle."
         )
     else:

@@ -145,6 +145,20 @@ def test_a_calculation_in_klippy_log(probed):
     assert distance.carriages == pytest.approx(log.carriages[[1, 0]], abs=1e-12)
 
 
+def test_manual_heights_of_a_calculation_are_those_of_the_nozzle(probed):
+    """They are not used beside a probe at another place; without a probe all are."""
+    probe = "[probe]\nx_offset: 20\nz_offset: 1.5\n"
+    log = probed(probe + calculation())
+    assert len(log.heights) == 3
+    assert "Manual heights are not used (1)" in log.notes[0]
+    assert log.settings.probe == pytest.approx((20.0 * MM, 0.0, -1.5 * MM))
+    assert log.heights == pytest.approx(np.zeros(3))
+    by_hand = calculation().replace("(1.5, (", "(0.0, (")
+    log = probed(probe + by_hand)
+    assert log.settings.probe == pytest.approx((0.0, 0.0, -1.5 * MM))
+    assert log.heights == pytest.approx(np.array([-1.4, -1.5, -1.5, -1.5]) * MM)
+
+
 def test_tables_of_g33_and_grids(probed):
     """G33 prints names of towers, a bilinear grid rows from the front to the back."""
     base = nominal()
