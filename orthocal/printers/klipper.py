@@ -200,9 +200,8 @@ def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
             where=line,
         ) from None
     # heights of the probe follow the manual ones, and all are its z_offset
-    manual, probed = (
-        [p for p in pairs if (p[0] == pairs[-1][0]) is last] for last in (False, True)
-    )
+    manual = [pair for pair in pairs if pair[0] != pairs[-1][0]]
+    probed = [pair for pair in pairs if pair[0] == pairs[-1][0]]
     return _log_from_steps(probed, manual, distances, settings, steps, line)
 
 

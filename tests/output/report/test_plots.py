@@ -17,8 +17,9 @@ from scipy import stats
 from orthocal import Choice, calibrate, load_session
 from orthocal.output.report import figure as style
 from orthocal.output.report import parameter_plots, reading_plots, study_plots
+from orthocal.output.report.page import _correlations
 from orthocal.output.text import layout
-from orthocal.output.text.tables import render_readings
+from orthocal.output.text.tables import render_fit, render_readings
 from orthocal.study.bootstrap import BootstrapSummary, Scatter
 from orthocal.study.sensitivity import SensitivitySummary
 from orthocal.units import MM
@@ -300,6 +301,11 @@ def test_plots_of_many_readings_stay_small(many):
     for name in ("residuals", "setups", "spread"):
         plot = getattr(reading_plots, f"plot_{name}")
         assert len(plot(many)) < LARGEST
+
+
+def test_an_unknown_noise_is_named_once(unknown):
+    assert "correlations are unknown, because the noise" in _correlations(unknown)
+    assert layout.to_text(render_fit(unknown)).rstrip().endswith("σ of a difference: unknown")
 
 
 def test_cycles_are_named_where_there_are_some(raw, table1):
