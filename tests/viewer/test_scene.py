@@ -366,7 +366,7 @@ def test_session_shows_the_nominal_machine_and_the_deviations(raw_cycles):
     assert not links(scene, drawing.SOLID)
     assert not [p for p in scene.nodes if p.startswith(readings.AFTER)]
     worst = max(measure_deviations(raw_cycles), key=lambda d: abs(d.before))
-    assert f"{abs(worst.before) * 1e3:.3f} mm" in scene.headline
+    assert f"{abs(worst.before) * 1e3:.3f} mm in setup {worst.setup}, " in scene.headline
 
 
 def test_plan_shows_the_places_of_the_gauges(root):
