@@ -41,7 +41,10 @@ from orthocal.units import UM
 GREY = "#777777"
 
 SMALLEST_DRAWN_MM = 1e-4
-"""Smallest error on a logarithmic axis, [mm]."""
+"""Smallest error of the estimates on a logarithmic axis, [mm]."""
+
+SMALLEST_DRAWN_UM = 1e-3
+"""Smallest tool error on a logarithmic axis, [µm]; that of an exact machine is zero."""
 
 MAX_ERRORS = 40
 """Largest number of errors in a plot."""
@@ -60,20 +63,21 @@ def plot_machines(table: StudyTable, predicted: float) -> Figure:
     """
     figure = open_figure(3.2, "Share of machines below a tool error")
     axes = figure.subplots()
-    drawn = [np.ones(1)]
+    drawn = [predicted] if math.isfinite(predicted) else []
     for name, colour, label in (
         ("before_um", BEFORE, "before calibration"),
         ("tool_um", AFTER, "after calibration"),
     ):
         values = np.array(table.columns.get(name, []), dtype=np.float64)
-        values = np.sort(values[np.isfinite(values)])
+        values = np.sort(values[np.isfinite(values)]).clip(min=SMALLEST_DRAWN_UM)
         if values.size:
             share = 100.0 * (np.arange(values.size) + 1) / values.size
             axes.plot(values, share, color=colour, label=label)
-            drawn.append(values)
+            drawn += [values[0], values[-1]]
     if math.isfinite(predicted):
         axes.axvline(predicted, color="black", linestyle=":", label="predicted RMS")
-    scale_log(axes, "x", np.concatenate(drawn[1:] or drawn))
+    scale_log(axes, "x", np.array(drawn or [1.0]))
+    axes.set_ylim(bottom=0.0)
     _finish(figure, axes, "tool error, workpiece aligned [µm]", "machines [%]")
     return figure
 
@@ -175,7 +179,8 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
         plan: The plan.
         unit: Unit of its criterion, [m] for a tool error, otherwise 1.
     """
-    figure = open_figure(3.2, "Expected error over measuring time")
+    quantity = "Expected error" if unit == UM else "Criterion"
+    figure = open_figure(3.2, f"{quantity} over measuring time")
     axes = figure.subplots()
     stages = [s for s in plan.curve if s.setups]
     hours, errors = [s.minutes / HOUR for s in stages], [s.error / unit for s in stages]

@@ -229,6 +229,15 @@ def test_long_names_remain_distinct_and_leave_space_for_the_plot(table1):
     assert max(map(len, row_names(figure.axes[0]))) == layout.LONGEST_NAME
 
 
+def test_tool_errors_of_exact_machines_and_their_prediction_are_on_the_axis():
+    table = SimpleNamespace(columns={"before_um": [0.0, 0.0], "tool_um": [3.0, np.nan]})
+    (axes,) = study_plots.plot_machines.figure(table, 70.0).axes
+    low, high = axes.get_xlim()
+    assert 1e-5 < low < line(axes, "before")[0].min()
+    assert high > 70.0
+    assert axes.get_ylim()[0] == 0.0
+
+
 def test_residuals_are_listed_before_and_after_the_worst_first(table1):
     figure = reading_plots.plot_residuals.figure(table1)
     axes = figure.axes[0]
