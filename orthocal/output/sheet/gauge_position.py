@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.measurement.motion.motion import Guidance, SetupMotion
+from orthocal.measurement.motion.guidance import Guidance
+from orthocal.measurement.motion.motion import SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.sensors.tips import Tip

@@ -14,15 +14,8 @@ from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length, describe_approach
-from orthocal.measurement.motion.motion import (
-    SetupMotion,
-    Stop,
-    guide,
-    plan_motion,
-    range_of_expected,
-    set_dial,
-    shown_joints,
-)
+from orthocal.measurement.motion.guidance import guide, range_of_expected, set_dial, shown_joints
+from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.observation.conditions import needed_conditions
 from orthocal.observation.gauge_noise import usual_difference

@@ -24,7 +24,8 @@ from orthocal.measurement.motion.approach import (
     fill_approach,
     label_reading,
 )
-from orthocal.measurement.motion.motion import guide, plan_motion, set_dial
+from orthocal.measurement.motion.guidance import guide, set_dial
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recording import RecordedReading, Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
