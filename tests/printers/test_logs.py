@@ -83,6 +83,18 @@ def test_console_lines_of_klipper_old_and_new(probed):
     assert np.abs(np.array(old.settings.homed) - old.carriages - expected).max() < 1e-9
 
 
+def test_settings_of_a_later_start_of_klipper_are_not_those_of_the_probing(probed):
+    """The log of a printer that was calibrated and started again after it was probed."""
+    before = write_settings("klipper", odd()) + "[probe]\nz_offset: 1.5\n"
+    after = write_settings("klipper", nominal()) + "[probe]\nz_offset: 2\n"
+    points = "".join(f"probe at {x},{y} is z={z}\n" for x, y, z in POINTS)
+    expected = probed(before + points)
+    log = probed(before + points + after)
+    assert log.settings == expected.settings
+    assert np.abs(log.carriages - expected.carriages).max() < 1e-12
+    assert probed(before + calculation() + after).settings.probe[2] == pytest.approx(-1.5 * MM)
+
+
 @pytest.mark.parametrize(
     ("firmware", "key"),
     [("klipper", "z_offset"), ("marlin", "M851 Z"), ("reprapfirmware", "G31 Z")],
