@@ -153,8 +153,8 @@ def _flatten(content: RenderableType) -> list[str | Table]:
         return [part for inner in content.renderables for part in _flatten(inner)]
     if isinstance(content, Padding):
         return _flatten(content.renderable)
-    if isinstance(content, Text):
-        return [content.plain]
+    if isinstance(content, Text):  # a command is not wrapped
+        return [f"`{content.plain.strip()}`" if content.no_wrap else content.plain]
     if isinstance(content, Table):
         return [content]
     raise TypeError(f"no HTML for a {type(content).__name__}")

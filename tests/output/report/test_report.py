@@ -205,7 +205,8 @@ def test_loaded_calibration_makes_the_same_report(calibration, tmp_path):
     loaded = load_calibration(path)
     same = replace(loaded, path=None)
     assert build_short_report(same) == build_short_report(calibration)
-    assert f"orthocal again {tmp_path} --out {tmp_path}-again" in build_short_report(loaded)
+    command = f"orthocal again {tmp_path} --out {tmp_path}-again"
+    assert f"<code>{command}</code>" in build_short_report(loaded)
 
 
 def build_short_report(calibration):
