@@ -395,7 +395,7 @@ def _sections(text: str) -> dict[str, dict[str, str]]:
     return sections
 
 
-def _sections_before(text: str, position: int) -> Sections:
+def _sections_before(text: str, position: int) -> dict[str, dict[str, str]]:
     """Settings before a position, as each start prints them; all if those before are incomplete."""
     before = _sections(text[:position])
     return before if "stepper_a" in before else _sections(text)
