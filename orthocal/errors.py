@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from orthocal.text import printable
 
 LONGEST_MESSAGE = 2000
@@ -21,11 +23,15 @@ class OrthocalError(Exception):
     Attributes:
         where: File and line or key of the error, or None.
         problem: What was found and what was expected.
+        missing: Missing keys of a document; empty for other errors.
     """
 
     exit_code = 2
 
-    def __init__(self, problem: str, *, where: str | None = None) -> None:
+    def __init__(
+        self, problem: str, *, where: str | None = None, missing: Sequence[str] = ()
+    ) -> None:
+        self.missing = tuple(missing)
         self.where = None if where is None else _shorten(printable(where), LONGEST_PLACE)
         place = "" if self.where is None else f"{self.where}: "
         self.problem = _shorten(printable(problem), LONGEST_MESSAGE - len(place))

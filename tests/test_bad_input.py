@@ -30,6 +30,8 @@ CYCLES = ROOT / "examples/raw-cycles"
 pytestmark = pytest.mark.usefixtures("short_reports")
 
 PROGRAM = "G21 G0 X0 Y0 Z0\nG1 X1 F100\n"
+REPEATABLE = {"--error"}
+"""Options in the beginnings of commands that may be stated several times."""
 ESCAPES = {r"\n": "\n", r"\t": "\t", r"\s": " "}
 
 
@@ -56,13 +58,16 @@ def read_cases(text):
             file, base, command = cells[1:-1].split(" | ")
         elif cells:
             name, edits, error, *options = cells.split(" | ")
+            begin = command.removesuffix("-")
+            for option in set(re.findall(r"--[\w-]+", " ".join(options))) - REPEATABLE:
+                begin = re.sub(rf" {option} \S+", "", begin)
             found = (re.fullmatch(r"(?:\[(\S+)\] )?(.+)", e) for e in edits.split(" && "))
             cases.append(
                 Case(
                     name,
                     tuple((e[1] or file, e[2]) for e in found if e[2] != "-"),
                     f"{{tmp}}/{file}{error}" if error.startswith(":") else error,
-                    " ".join([command.removesuffix("-"), *options]),
+                    " ".join([begin, *options]),
                     base,
                 )
             )

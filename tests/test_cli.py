@@ -658,9 +658,10 @@ def test_export_refuses_a_module_beside_offsets(days, tmp_path):
         ("--seed -1", "'--seed': found '-1'; expected at least 0"),
         ("--across-mm far", "'--across-mm': found 'far'; expected a number"),
         ("--along 99", "'--along': found '99'; expected at most 50"),
+        ("--gauge one.yaml --gauge two.yaml", "'--gauge': is stated twice; expected once"),
     ],
 )
-def test_wrong_numbers_of_options_are_shown(words, message):
+def test_wrong_values_of_options_are_refused(words, message):
     code, out, err = orthocal("plan", "orthoglide", *words.split())
     assert (code, out) == (2, "")
     assert f"Invalid value for {message}\n" in err

@@ -329,7 +329,7 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     [
         *("--hours 2", "--effects none", "--effects thermal", "--paper", "--model offsets"),
         *("--screw-lead-mm 5", "--temperature 20:28", "--gauge dial.yaml", "--with bar.yaml"),
-        *("--tolerance *.offset_mm=9", "--workspace-mm 50"),
+        *("--tolerance *.offset_mm=9", "--workspace-mm 50", "--force"),
     ],
 )
 def test_options_of_a_plan_are_refused_with_again(copied, words):

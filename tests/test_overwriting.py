@@ -182,3 +182,19 @@ def test_a_plan_that_does_not_load_is_replaced(folder, table):
     if table is not None:
         readings.write_text(table)
     assert run_orthocal(folder, "again", "one", "--out", "session", "--force").returncode == 0
+
+
+def test_a_new_plan_removes_what_orthocal_wrote_of_an_earlier_one(folder):
+    """Programs of other setups would move the machine through postures of the earlier plan."""
+    session = folder / "session"
+    (session / "readings.csv").unlink()
+    old = {"07-old.ngc": "(orthocal: old, setup old, 7 of 7)\n", "08-mine.ngc": PROGRAM}
+    old |= {"plan.json": '{"schema": "orthocal/plan/1"}\n', "plan.svg": "<svg/>", "a.txt": MINE}
+    for name, text in old.items():
+        (session / name).write_text(text)
+    done = run_orthocal(folder, "again", "one", "--out", "session", "--force")
+    assert done.returncode == 0
+    assert "Removed from the earlier plan: 07-old.ngc, plan.json, plan.svg\n" in done.stderr
+    names = {p.name for p in session.iterdir()}
+    assert {"08-mine.ngc", "a.txt", "01-xy.ngc", "sheet.html"} <= names
+    assert not names & {"07-old.ngc", "plan.json", "plan.svg"}

@@ -58,9 +58,10 @@ def folder(tmp_path):
 
 @pytest.fixture
 def run(monkeypatch):
-    def record(folder, *lines, columns=100):
+    def record(folder, *lines, columns=100, terminal=False):
         monkeypatch.setenv("COLUMNS", str(columns))
-        return orthocal("record", folder, typed="".join(f"{line}\n" for line in lines))
+        typed = "".join(f"{line}\n" for line in lines)
+        return orthocal("record", folder, typed=typed, terminal=terminal)
 
     return record
 
@@ -752,6 +753,19 @@ def test_a_recording_that_continues_keeps_temperature_and_deleted_lines(folder, 
     assert "as typed before: 25 °C" in run(folder)[1]  # 18 °C was that of a corrected reading
 
 
+def test_a_recording_that_continues_keeps_the_side_and_the_stopped_clock(folder, run):
+    """No effect needs the side, so that nothing asks for it. A pipe has no clock."""
+    run(folder, "side n", "clock", "0.1", "clock", "0.2")
+    code, out, _ = run(folder, "0.3", "back 2", "side u", "", "0.4", terminal=True)
+    assert code == 0
+    text = " ".join(out.split())
+    assert "as typed before: approach ↓ (nnn). `side n` changes it." in text
+    assert "in their order, a minute apart. `clock` changes it." in text
+    rows = rows_of(folder)
+    assert [r["approach"] for r in rows] == ["uuu", "nnn", "nnn", "nnn", "", ""]
+    assert [bool(r["time"]) for r in rows] == [True, False, False, False, False, False]
+
+
 def test_setups_of_a_dial_and_gauges_have_no_brackets(folder, run):
     """They name the coordinates of points."""
     plan = (folder / "session.yaml").read_text()
@@ -794,9 +808,10 @@ def test_side_of_approach_is_asked_for_if_the_plan_states_none(folder, run):
     assert "Enter: ppp (↑), as the programs do" in text
     assert text.count("Not recorded: the side") == 1
     assert [r["approach"] for r in rows_of(folder)] == ["ppp", "nnn", "pnu", "pnu", "", ""]
-    # the same command continues, and asks again
-    _, out, _ = run(folder, "n", "0.05")
-    assert [r["approach"] for r in rows_of(folder)][4:] == ["nnn", ""]
+    # the same command continues, and asks again; Enter keeps the side
+    _, out, _ = run(folder, "", "0.05", "side n")
+    assert "Enter: pnu (↑↓·), as typed before." in " ".join(out.split())
+    assert [r["approach"] for r in rows_of(folder)][4:] == ["pnu", ""]
 
 
 def test_a_typed_side_is_corrected(folder, run):
@@ -918,11 +933,13 @@ def test_points_are_recorded_and_compared_with_their_prediction(tmp_path, run):
     points[3] = points[3].round(2)
     typed[3] = "{:.2f} {:.2f} {:.2f}".format(*points[3]).replace(".", ",")
     slip = points[-1] + [0.0, 1.0, 0.0]
-    code, out, err = run(tmp_path, "", "1 2", *typed, forms[0].format(*slip), "back 9", "", "")
+    incomplete = ("1 2", "1, ,2", "1.5,,2", "1;2;")
+    last = forms[0].format(*slip), "back 9", "", ""
+    code, out, err = run(tmp_path, "", *incomplete, *typed, *last)
     assert (code, err) == (0, "")
     assert "Setup track, 1 of 1: 8 readings" in out
     assert "Not recorded: type x, y and z of the point" in out
-    assert "Not recorded: '1 2' is no point" in out
+    assert all(f"Not recorded: '{text}' is no point" in out for text in incomplete)
     differs = re.search(r"! Line 9 y differs by ([0-9.]+) mm\.", out)
     assert float(differs[1]) == pytest.approx(1.0, abs=0.1)
     recorded = [[float(row[f"{k}_mm"]) for k in "xyz"] for row in rows_of(tmp_path)]

@@ -139,20 +139,22 @@ def plan_adjustments(
 
     Raises:
         RobotError: If the robot declares no adjustments, or has no tool that its drives command.
-        ParameterError: If a name is unknown, or the noise of the readings.
+        ParameterError: If no name or an unknown one is stated, or the noise of the readings is
+            unknown.
         ClosureError: If the machine cannot reach its workspace.
     """
     require_calibration(calibration)
     for name in among or ():
         require_adjustment(calibration.robot, name, where="among", error=ParameterError)
-    candidates = [
-        a for a in find_adjustments(calibration.robot) if among is None or a.name in among
-    ]
-    if not candidates:
+    declared = find_adjustments(calibration.robot)
+    if not declared:
         raise RobotError(
             "declares no mechanical adjustments; add orthocal.adjustments and calibrate again",
             where=str(calibration.robot.yaml),
         )
+    candidates = [a for a in declared if among is None or a.name in among]
+    if not candidates:
+        raise ParameterError("names no adjustment; expected one or several", where="among")
     tool = require_tool(calibration, find_tool(calibration))
     before = assessment_of(calibration).tool
     if before is None:

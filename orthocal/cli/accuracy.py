@@ -21,7 +21,7 @@ from orthocal.cli.options import (
     require_between,
 )
 from orthocal.cli.printing import deliver, print_rows, put_note
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError, ParameterError, SessionError
 from orthocal.text import quote_path
 from orthocal.units import MM
 
@@ -60,6 +60,8 @@ def accuracy(
 
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
+        if points is not None:
+            raise ParameterError("found with points; expected one of them", where="--half-side-mm")
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)

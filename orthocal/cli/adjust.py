@@ -31,7 +31,7 @@ def adjust(
     from orthocal.output.text import adjustment as text
 
     result = orthocal.load_calibration(calibration)
-    names = None if among is None else split_globs([among])
+    names = None if among is None else split_globs([among]) or [among]
     for name in names or ():
         require_adjustment(result.robot, name, where="--among", error=ParameterError)
     if not anyway:

@@ -20,7 +20,7 @@ from orthocal.cli.options import (
     require_between,
     split_globs,
 )
-from orthocal.cli.overwriting import require_new_session
+from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ExportError, ParameterError
@@ -112,7 +112,7 @@ def _write(new: orthocal.Session, out: Path, validating: str) -> None:
     )
     sheet, problem = sheet_or_problem(new, following=validating)
     put_note(problem)
-    orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
+    write_plan(new, out, comment=comment, files=sheet)
 
 
 def _note_numbers(new: orthocal.Session) -> None:
@@ -200,7 +200,10 @@ def _describe_entries(
             f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "
             "remove it from `controller` in session.yaml."
         )
-    return f"{text}\nThen home, measure and compare:"
+    return (
+        f"{text}\nThen home, measure and compare. Also name all other sessions that were measured "
+        "with these offsets:"
+    )
 
 
 def _describe_conversion(

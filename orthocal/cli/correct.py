@@ -34,12 +34,7 @@ from orthocal.cli.options import (
 from orthocal.cli.overwriting import require_replaceable_file
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import CalibrationFileError, GcodeError, OutputError, ParameterError
-from orthocal.io.files import (
-    is_folder,
-    read_file,
-    read_parts,
-    write_file,
-)
+from orthocal.io.files import is_folder, read_file, read_parts, write_file
 from orthocal.text import comment_safe, shorten
 from orthocal.units import MM, UM, format_fixed
 

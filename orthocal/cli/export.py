@@ -21,11 +21,7 @@ from orthocal.cli.options import (
     read_numbers,
     read_vector,
 )
-from orthocal.cli.overwriting import (
-    mark_written,
-    require_replaceable_results,
-    require_same_text,
-)
+from orthocal.cli.overwriting import mark_written, require_replaceable_results, require_same_text
 from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
@@ -77,7 +73,7 @@ def export(
     """
     result = orthocal.load_calibration(calibration)
     stated = {"--home-offset": home_offset, "--latched": latched}
-    joints = None if ini is None else _read_joints(ini, result, stated)
+    joints = None if ini is None else _read_joints(ini, result, to, stated)
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
@@ -173,22 +169,26 @@ def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
 
 
 def _read_joints(
-    path: Path, calibration: orthocal.Calibration, stated: Mapping[str, str | None]
+    path: Path, calibration: orthocal.Calibration, to: str, stated: Mapping[str, str | None]
 ) -> ControllerJoints:
     """Read the joints of an INI file; refuse a compensation that differs from the session's.
 
     Args:
         path: The INI file.
         calibration: The calibration.
+        to: Format of the export.
         stated: Values of the options that the file replaces, by option.
 
     Raises:
-        ParameterError: If the compensation differs, or such an option is stated.
+        ParameterError: If the format is another one, the compensation differs, or such an option is
+            stated.
     """
     from orthocal.effects.compensation import JointTrim
     from orthocal.export.linuxcnc.entered_lines import compare_joints
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
+    if to != "linuxcnc":
+        raise ParameterError("is an option of --to linuxcnc only", where="--ini")
     joints = read_controller_joints(path, calibration.robot)
     in_file = {"--home-offset": joints.home_offsets, "--latched": joints.latched}
     for option, value in stated.items():

@@ -128,7 +128,8 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
         complete or _are_copied(session, common, equal)
     ):
         return
-    lines = sorted({r.line for r in common if r not in equal and r.line is not None})
+    copied = {r.key for r in equal}
+    lines = sorted({r.line for r in common if r.key not in copied and r.line is not None})
     exception = f" except {spans(lines, 'line')}" if lines else ""
     raise SessionError(
         f"has the same readings as {other.path}{exception}: a copy that was not measured again?",

@@ -28,7 +28,7 @@ from orthocal.cli.options import (
     read_workspace,
     split_effects,
 )
-from orthocal.cli.overwriting import require_new_session
+from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import following_command, note_beyond_limits
 from orthocal.errors import (
@@ -210,11 +210,13 @@ def new(
     if again:
         stated: dict[str, object] = {o: text for o, text in dimensions.by_key().values()}
         stated |= {"--kind": dimensions.kind} | options.changed()
-        _require_none(stated | {"--backlash": controller.backlash, "--ini": controller.ini})
+        stated |= {"--backlash": controller.backlash, "--ini": controller.ini}
+        _require_none(stated | {"--force": force or None}, "--again, which reads machine.yaml")
         _make_again(folder)
         return
-    if options.paper and options.hours is not None:
-        raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
+    if options.paper:
+        free = {"--hours": options.hours, "--temperature": options.temperature}
+        _require_none(free | {"--with": options.with_}, "--paper, whose setups are fixed")
     name = _require_new(folder, force=force)
     design = _design(name, dimensions, options, controller)
     _write(folder, name, design)
@@ -316,7 +318,7 @@ def _write(folder: Path, name: str, design: _Design) -> None:
     robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(design.session, robot=robot, robot_reference=str(folder.resolve()))
     comment = COMMENT.format(calibrating=_calibrating())
-    orthocal.write_session(session, folder / FIRST, comment=comment, extra=design.files, blank=True)
+    write_plan(session, folder / FIRST, comment=comment, files=design.files)
 
 
 def _calibrating() -> str:
@@ -348,11 +350,15 @@ def _make_trial(
         raise ParameterError(problem, where="--effects") from None
 
 
-def _require_none(options: Mapping[str, object]) -> None:
-    """Refuse options that --again reads from machine.yaml."""
+def _require_none(options: Mapping[str, object], other: str) -> None:
+    """Refuse stated options, which have no effect together with another one.
+
+    Raises:
+        ParameterError: If an option has a value.
+    """
     for option, value in options.items():
         if value is not None:
-            raise ParameterError("found with --again, which reads machine.yaml", where=option)
+            raise ParameterError(f"found with {other}", where=option)
 
 
 def _require_new(folder: Path, *, force: bool) -> str:

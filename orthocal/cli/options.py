@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_args, get_t
 
 import typer
 from typer import Argument, Option
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import orthocal
 from orthocal.errors import ParameterError
@@ -74,6 +74,19 @@ class PanelGroup(TyperGroup):
                 formatter.write_dl(lines)
 
 
+class CommandOnce(TyperCommand):
+    """Command that refuses an option that is stated twice and has one value."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - Click's types
+        """Read the options; the last of several values would replace the others."""
+        order: list[Any] = self.make_parser(ctx).parse_args(args=list(args))[2]
+        remaining = super().parse_args(ctx, args)
+        for option in order:
+            if order.count(option) > 1 and not option.multiple:
+                raise typer.BadParameter("is stated twice; expected once", ctx=ctx, param=option)
+        return remaining
+
+
 def make_group(description: str, **settings: Any) -> typer.Typer:  # noqa: ANN401 - Typer's settings
     """Make a group of commands."""
     return typer.Typer(
@@ -124,7 +137,7 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # of callables
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
-        group.command(name, help=text)(call)
+        group.command(name, cls=CommandOnce, help=text)(call)
         return function
 
     return register

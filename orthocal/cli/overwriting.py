@@ -10,10 +10,16 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.io.files import exists, read_file, require_writable, require_writable_file
+
+if TYPE_CHECKING:
+    from orthocal.session.session import Session
 
 SIMULATED = "Simulated"
 """First word of the source of a simulated session."""
@@ -106,6 +112,36 @@ def _require_no_readings(directory: Path) -> None:
             f"{'it' if count == 1 else 'them'} first",
             where=str(path),
         )
+
+
+def write_plan(
+    session: Session, directory: Path, *, comment: str, files: Mapping[str, str]
+) -> Path:
+    """Write a planned session, and remove files of an earlier plan that it does not replace.
+
+    Otherwise the programs of other setups would remain beside the new sheet.
+
+    Args:
+        session: The plan.
+        directory: Its directory, which `require_new_session` allows to overwrite.
+        comment: Comment at the top of the session.yaml.
+        files: Texts of the other files by name.
+
+    Returns:
+        Path of the session.yaml.
+    """
+    from orthocal.measurement.files.write_session import write_session
+
+    path = write_session(session, directory, comment=comment, extra=files, blank=True)
+    others = [directory / "sheet.html", directory / "plan.json", *directory.glob("[0-9]*-*.ngc")]
+    old = sorted(p for p in others if p.name not in files and exists(p) and _is_marked(p))
+    old += [p.with_suffix(".svg") for p in old if p.suffix == ".json"]
+    for file in old:
+        with suppress(OSError):
+            file.unlink()
+    if old:
+        put_note(f"Removed from the earlier plan: {', '.join(p.name for p in old)}")
+    return path
 
 
 def count_numbers(path: Path) -> int:

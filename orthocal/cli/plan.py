@@ -37,7 +37,7 @@ from orthocal.cli.options import (
     split_effects,
     split_globs,
 )
-from orthocal.cli.overwriting import require_new_session
+from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
 from orthocal.errors import ParameterError
@@ -233,7 +233,7 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path, calibrating: str) -> N
     )
     put_note(problem)
     files = {"plan.json": plan_json(plan), "plan.svg": figure, **sheet}
-    path = orthocal.write_session(plan.session, directory, comment=comment, extra=files, blank=True)
+    path = write_plan(plan.session, directory, comment=comment, files=files)
     sheet_names = ", sheet.html and its programs" if sheet else ""
     put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{sheet_names}")
 

@@ -10,7 +10,9 @@ from orthocal.errors import SessionError
 from orthocal.io.tables.numerals import plain_minus
 from orthocal.kinematics.conditions import APPROACH, find_approach_problem
 from orthocal.measurement.files.readings_checks import parse_temperature
-from orthocal.measurement.recording import RecordedReading, Recording
+from orthocal.measurement.recorded_rows import RecordedReading
+from orthocal.measurement.recording import Recording
+from orthocal.measurement.recording_journal import NextConditions
 from orthocal.observation.conditions import needed_conditions
 from orthocal.session.session import Conditions
 
@@ -27,7 +29,8 @@ class RecordedConditions:
     A condition that is typed while an existing reading is corrected applies to that reading only.
     If an effect needs the temperature, it is asked for in each setup. The side of approach is asked
     for once if an effect needs it and the plan does not state it. The time is that of the clock,
-    unless readings come from a file or from paper.
+    unless readings come from a file or from paper. A recording that continues proposes the
+    conditions that were typed last.
 
     Args:
         recording: The recording.
@@ -35,14 +38,20 @@ class RecordedConditions:
     """
 
     def __init__(self, recording: Recording, programmed: str) -> None:
-        self.temperature = recording.temperature
+        before = recording.following
+        self._needed = needed_conditions(recording.session.robot)
+        self.temperature = before.temperature
         self.is_unusual = False
         """Whether the temperature that was typed last may be a mistake."""
-        self.approach: str | None = None
-        self.clock = sys.stdin is not None and sys.stdin.isatty()
-        self.programmed = programmed
+        typed = before.approach
+        if typed is not None and find_approach_problem(typed, recording.session.robot):
+            typed = None  # the robot has other drives now
+        self.proposed = typed or programmed
+        """Approach that Enter accepts where it is asked for."""
+        self.approach = None if "approach" in self._needed else typed
+        at_terminal = sys.stdin is not None and sys.stdin.isatty()
+        self.clock = at_terminal and before.clock is not False
         self._recording = recording
-        self._needed = needed_conditions(recording.session.robot)
         self._asked: set[str] = set()
         """Setups whose temperature was asked for."""
         self._following: tuple[str | None, float | None] | None = None
@@ -82,14 +91,24 @@ class RecordedConditions:
         if row is not None and row.is_read and self._following is None:
             self._following = self.approach, self.temperature
         if condition == "approach":
-            self._set_approach(text or self.programmed)
+            self.approach = self._read_approach(text or self.proposed)
+            self._keep(NextConditions(approach=self.approach))
             return
         if text:
             self.temperature = self._read_temperature(text)
-            if self._following is None:
-                self._recording.note_temperature(self.temperature)
+            self._keep(NextConditions(temperature=self.temperature))
         if row is not None:
             self._asked.add(row.setup_in_file)
+
+    def switch_clock(self) -> None:
+        """Begin or stop to note times, also in the next recording."""
+        self.clock = not self.clock
+        self._recording.note(NextConditions(clock=self.clock))
+
+    def _keep(self, condition: NextConditions) -> None:
+        """Keep a condition for the next recording, unless it is that of a corrected reading."""
+        if self._following is None:
+            self._recording.note(condition)
 
     def end_correction(self) -> None:
         """Restore the conditions of the following readings after an existing one."""
@@ -104,13 +123,13 @@ class RecordedConditions:
         self.is_unusual = not _is_usual(temperature) or change > USUAL_CHANGE
         return temperature
 
-    def _set_approach(self, text: str) -> None:
-        """Set the approach: one letter for each drive, or for all."""
+    def _read_approach(self, text: str) -> str:
+        """Approach as typed: one letter for each drive, or for all."""
         robot = self._recording.session.robot
         letters = text * len(robot.drives) if text in APPROACH else text
         if problem := find_approach_problem(letters, robot):
             raise SessionError(f"the side is {problem}; or one of these letters for all drives")
-        self.approach = letters
+        return letters
 
     def of(self, row: RecordedReading) -> Conditions:
         """Conditions of a reading that is typed now, without a planned approach."""

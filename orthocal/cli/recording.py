@@ -68,7 +68,8 @@ class Dialogue:
 
     def run(self) -> None:
         """Ask for readings until none is missing and Enter is typed, or the input ends."""
-        self._say(self._text.introduction())
+        before = Conditions(self._conditions.approach, self._conditions.temperature)
+        self._say(self._text.introduction(before))
         with raised_interrupt(), suppress(_EndOfDialogue):
             self._judge()
             self._ask_for_next()
@@ -103,8 +104,13 @@ class Dialogue:
             self._say("", self._text.setup(index))
             self._shown = setup
         self._say("", self._text.row(index))
+        self._ask_for_condition()
+
+    def _ask_for_condition(self) -> None:
+        """Print the question about a condition, if there is one."""
         if self._question is not None:
-            self._note(self._text.question(self._question, self._conditions.temperature))
+            noted = self._conditions
+            self._note(self._text.question(self._question, noted.temperature, noted.proposed))
 
     @property
     def _question(self) -> str | None:
@@ -189,8 +195,7 @@ class Dialogue:
         try:
             if self._question is not None and self._is_answer(word, arguments):
                 self._set_condition(self._question, word)
-                if self._question is not None:
-                    self._note(self._text.question(self._question, self._conditions.temperature))
+                self._ask_for_condition()
             elif not word:
                 self._keep()
             elif word[0].isalpha() or word == "?":
@@ -442,7 +447,7 @@ class Dialogue:
         return f"'{shorten(line)}' is not a line; expected {lines[0]} to {lines[-1]}"
 
     def _switch_clock(self) -> None:
-        self._conditions.clock = not self._conditions.clock
+        self._conditions.switch_clock()
         self._note(self._text.clock(on=self._conditions.clock))
 
     def _list(self) -> None:

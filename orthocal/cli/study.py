@@ -206,6 +206,9 @@ def linearisation(
         if value is not None:
             require_between(value, 0.0, 1e3, name)
     with _read_subject(subject, leg_mm) as (session, robot):
+        for name, value in (("--max-mm", max_mm), ("--min-mm", min_mm)):
+            if session is not None and value is not None:
+                raise ParameterError("is for a robot; found a session with postures", where=name)
         gauge = PAPER_GAUGE if session is None else session.gauge
         study = orthocal.build_linearisation_study(
             session or robot,

@@ -388,7 +388,9 @@ def validate(
     try:
         return cast("Record", _adapter(schema).validate_python(data))  # type: ignore[arg-type] # types are hashable
     except ValidationError as e:
-        key, problem = explain_validation_error(e, schema, under=under)
+        if missing := _find_missing(e, under):
+            raise missing_keys_error(missing, where, error) from None
+        key, problem = _explain(e, schema)
         key = ".".join(name for name in (under, key) if name)
         raise error(problem, where=f"{where}: {key}" if key else where) from None
 
@@ -431,17 +433,43 @@ def describe_missing(others: Sequence[str]) -> str:
     return f"is missing, and so {so} {list_some(others, MOST_SHOWN)}" if others else "is missing"
 
 
-def explain_validation_error(
-    exception: ValidationError, schema: type[Any], *, under: str = ""
-) -> tuple[str, str]:
-    """Key and problem of the first error in a pydantic ValidationError.
+def missing_keys_error(
+    keys: Sequence[str], where: str, error: type[OrthocalError]
+) -> OrthocalError:
+    """Error about missing keys of a document.
+
+    Args:
+        keys: The keys, at least one.
+        where: Name of the file.
+        error: Kind of the error.
+    """
+    return error(describe_missing(keys[1:]), where=f"{where}: {keys[0]}", missing=keys)
+
+
+def _find_missing(exception: ValidationError, under: str) -> list[str]:
+    """Missing keys; empty if another error comes first, or an unknown key may be a misspelled one.
+
+    Args:
+        exception: The error.
+        under: Key of the data in the file.
+    """
+    errors = exception.errors(include_url=False)
+    if errors[0]["type"] != "missing" or any(e["type"] in UNKNOWN_KEY for e in errors):
+        return []
+    paths = [list(e["loc"]) for e in errors if e["type"] == "missing"]
+    others = [path for path in paths[1:] if not any(map(_is_pydantic_tag, path))]
+    first = [part for part in paths[0] if not _is_pydantic_tag(part)]
+    prefix = f"{under}." if under else ""
+    return [prefix + _join(path) for path in (first, *others)]
+
+
+def _explain(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
+    """Key and problem of the first error in a pydantic ValidationError, an unknown key first.
 
     Args:
         exception: The error.
         schema: The model or dataclass.
-        under: Key of the data in the file, for other keys in the problem.
     """
-    # an unknown key may be a misspelled required key: name it before the missing one
     errors = exception.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] not in UNKNOWN_KEY)
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
@@ -453,10 +481,6 @@ def explain_validation_error(
         keys = _keys_at(schema, path[:-1])
         hint = f"; known keys: {', '.join(keys)}" if keys else ""
         return key, f"unknown key{hint}"
-    if kind == "missing":
-        missing = [e["loc"] for e in errors if e["type"] == "missing" and e is not first]
-        others = [_join(list(loc)) for loc in missing if not any(map(_is_pydantic_tag, loc))]
-        return key, describe_missing([f"{under}.{k}" if under else k for k in others])
     message = str(first["msg"]).removeprefix("Value error, ")
     if kind in ("value_error", "assertion_error"):
         # the message of a validator of several keys has the form "KEY|PROBLEM"

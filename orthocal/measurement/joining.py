@@ -245,7 +245,7 @@ def _labels(sessions: Sequence[Session]) -> list[dict[str, str]]:
             names += [(i, label, label) for label in dict.fromkeys(session.labels)]
             continue
         folder = "" if session.path is None else session.path.resolve().parent.name
-        label = "".join("_" if c.isspace() or c in ',;"/' else c for c in composed(folder))
+        label = "".join("_" if c.isspace() or c in ',;"/[]' else c for c in composed(folder))
         names.append((i, "", label or f"session-{len(names) + 1}"))
     if len({new for _, _, new in names}) < len(names):
         names = [(i, old, f"{new}-{k}") for k, (i, old, new) in enumerate(names, start=1)]

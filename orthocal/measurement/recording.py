@@ -3,9 +3,6 @@
 A row keeps its line in the CSV: added rows come last, and a blank line remains where a row was
 deleted.
 
-An approach is planned, or the operator types it with the reading. The CSV has one column for both.
-The journal states which approaches were typed: they are corrected and deleted with their readings.
-
 A change is appended to a journal beside the readings.csv and synced; then the CSV is replaced. Each
 line of the journal holds the digests of the CSV before and after its change. If the process is
 killed or the power fails, the CSV contains the changes up to some line of the journal. The later
@@ -16,21 +13,16 @@ counts, edited or not.
 from __future__ import annotations
 
 import hashlib
-import math
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.io.documents import Keys, Number, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
 from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of
@@ -38,23 +30,22 @@ from orthocal.measurement.files.readings_checks import check_conditions, check_r
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.files.session_edits import add_alignment, add_readings
 from orthocal.measurement.files.session_file import load_plan, session_digest
-from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
+from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
+from orthocal.measurement.recorded_rows import (
+    Change,
+    RecordedReading,
+    change_rows,
+    find_dropped,
+    recorded_rows,
+)
+from orthocal.measurement.recording_journal import CLOSED, NextConditions, find_pending, read_lines
 from orthocal.runtime.interrupts import postponed_interrupt
-from orthocal.sensors.points import Coordinate
 from orthocal.sensors.protocol import largest_reading
 from orthocal.session.order import order_of_measurement
 from orthocal.session.points import base_name, gather_points
-from orthocal.session.session import (
-    Conditions,
-    Reading,
-    ReadingKey,
-    Session,
-    known_approach,
-)
+from orthocal.session.session import Conditions, Reading, ReadingKey, Session
 from orthocal.units import MM, to_mm
-
-FORMAT = "orthocal/recording/1"
 
 SUFFIX = ".journal"
 """Suffix of the journal, after the name of the CSV."""
@@ -62,182 +53,10 @@ SUFFIX = ".journal"
 LONGEST_LINE = 2**16
 """Largest length of a line of the journal, [bytes]: a line names six rows at most."""
 
-CLOSED: dict[str, Any] = {"closed": True}
-"""Last line of a recording that ended regularly."""
-
 DECIMALS = 9
 """Decimals of a recorded reading in mm."""
 
 BUSY = "these readings are being recorded by another process; one at a time"
-
-
-class Change(Keys):
-    """Change of the rows of a recording."""
-
-    done: Literal["read", "emptied", "added", "dropped"]
-    """Kind of change: `read` gives a row its value; `emptied` removes the values of all rows of its
-    setup; `added` appends another row after it; `dropped` deletes it. The three rows of a point
-    change together."""
-    rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
-    """Keys of the row, or of the three rows of a point, then of as many added rows."""
-    reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
-        None
-    )
-    point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
-    """Readings of the three rows of a point."""
-    conditions: Conditions | None = None
-    """Conditions stated with the value; those that are None do not change, except that an approach
-    is planned unless it is stated."""
-    line: int | None = None
-    """Line of a deleted row, by which it can be added again."""
-
-
-class _JournalLine(Change):
-    at: str
-    before: str
-    after: str
-
-
-class _Temperature(Keys):
-    """Line of the journal: temperature that is recorded with the next readings, [°C]."""
-
-    temperature: Annotated[Number, Field(alias="temperature_C")]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Past:
-    """Content of a journal."""
-
-    closed: list[_JournalLine]
-    """Changes of the recordings that ended regularly."""
-    lines: list[tuple[str, _JournalLine]]
-    """Later changes with their places."""
-    temperature: float | None
-    """Temperature that was typed last, [°C]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedReading(Reading):
-    """Row of a recording.
-
-    Args:
-        has_typed_approach: Whether the approach was typed with the reading, and not planned.
-    """
-
-    has_typed_approach: bool = False
-
-    @property
-    def setup_in_file(self) -> str:
-        """Name of the setup in the files; the three setups of a point have one name there."""
-        return base_name(self.setup)
-
-    @property
-    def planned_approach(self) -> str | None:
-        """Approach that the plan states; None if it states none."""
-        return None if self.has_typed_approach else self.approach
-
-    @property
-    def emptied(self) -> RecordedReading:
-        """Row without its reading and all that was typed with it; only the approach is planned."""
-        planned = None if self.conditions is None else self.conditions.approach
-        conditions = Conditions(planned) if planned and not self.has_typed_approach else None
-        return replace(self, value=math.nan, conditions=conditions, has_typed_approach=False)
-
-    def with_reading(self, value: float, stated: Conditions | None) -> RecordedReading:
-        """Row with a reading, [m], and the conditions that are stated with it."""
-        old, new = self.conditions or Conditions(), stated or Conditions()
-        conditions = Conditions(
-            new.approach or old.approach,
-            old.temperature if new.temperature is None else new.temperature,
-            new.time or old.time,
-        )
-        return replace(
-            self,
-            value=value,
-            conditions=None if conditions == Conditions() else conditions,
-            has_typed_approach=new.approach is not None,
-        )
-
-
-def change_rows(rows: Sequence[RecordedReading], change: Change) -> tuple[RecordedReading, ...]:
-    """Rows after a change.
-
-    Raises:
-        SessionError: If a row to change does not exist, or a changed row equals another one.
-    """
-    indices = {row.key: i for i, row in enumerate(rows)}
-    changed = list(rows)
-    count = len(change.rows) // 2 if change.done == "added" else len(change.rows)
-    keys, added = change.rows[:count], change.rows[count:]
-    for key in keys:
-        if key not in indices:
-            raise SessionError(f"there is no row {' '.join(str(k) for k in key if k)}")
-    selected = [indices[key] for key in keys]
-    if change.done == "read":
-        values = change.point_mm or [v for v in (change.reading_mm,) if v is not None]
-        if len(values) != len(selected):
-            raise SessionError("the reading is missing")
-        for index, value in zip(selected, values, strict=True):
-            changed[index] = rows[index].with_reading(value * MM, change.conditions)
-    elif change.done == "emptied":
-        setup = base_name(keys[0][0])
-        changed = [r.emptied if r.setup_in_file == setup else r for r in changed]
-    elif change.done == "dropped":
-        changed = [row for i, row in enumerate(changed) if i not in selected]
-    else:
-        if len(added) != len(keys):
-            raise SessionError("the added row is not named")
-        line = 1 + max(r.line or 0 for r in rows)
-        for setup, posture, minus, cycle, *approach in added:
-            conditions = Conditions(approach[0]) if approach else None
-            new = RecordedReading(setup, posture, minus, cycle, math.nan, conditions=conditions)
-            changed.append(replace(new, line=line))
-    number = Counter(row.key for row in changed)
-    for row in changed:
-        if number[row.key] > 1:
-            raise SessionError(f"{row.label_with_cycle} exists already")
-    return tuple(changed)
-
-
-def _replay(
-    changes: Iterable[Change],
-) -> tuple[set[ReadingKey], dict[int, list[ReadingKey]]]:
-    """Keys of the rows whose approach was typed, and keys without readings of deleted rows by line.
-
-    Args:
-        changes: All changes, the first one first.
-    """
-    typed: set[ReadingKey] = set()
-    dropped: dict[int, list[ReadingKey]] = {}
-    for change in changes:
-        if change.done == "dropped" and change.line is not None:
-            dropped[change.line] = [key[:4] if key in typed else key for key in change.rows]
-        if change.done in ("read", "dropped"):
-            typed.difference_update(change.rows)
-        if change.done == "read" and change.conditions and change.conditions.approach:
-            known = known_approach(change.conditions)
-            places = [key[:4] for key in change.rows]
-            typed.update(place if known is None else (*place, known) for place in places)
-    return typed, dropped
-
-
-def _recorded_rows(
-    readings: Sequence[Reading], changes: Iterable[Change]
-) -> tuple[RecordedReading, ...]:
-    """Rows of a session that is recorded.
-
-    Args:
-        readings: The readings as in the CSV.
-        changes: All changes that the journal contains and the CSV has.
-    """
-    typed, _ = _replay(changes)
-    return tuple(
-        RecordedReading(
-            *(r.setup, r.posture, r.minus, r.cycle, r.value, r.line, r.file, r.conditions),
-            has_typed_approach=r.is_read and r.key in typed,
-        )
-        for r in readings
-    )
 
 
 @dataclass(slots=True, eq=False)
@@ -254,8 +73,8 @@ class Recording:
     """Digest of the CSV on disk."""
     dropped: dict[int, list[ReadingKey]]
     """Keys of the rows that earlier recordings deleted, by their line."""
-    temperature: float | None
-    """Temperature that was typed last, [°C]."""
+    following: NextConditions
+    """Conditions of the next readings that were typed last, also in earlier recordings."""
     restored: int
     """Number of changes that a killed recording had not written to the CSV."""
     edited: bool
@@ -483,14 +302,14 @@ class Recording:
         self._apply(Change(done="added", rows=[*existing, *dropped]))
         return len(self.rows) - len(dropped)
 
-    def note_temperature(self, temperature: float) -> None:
-        """Keep the temperature, [°C], of the next readings for the next recording.
+    def note(self, conditions: NextConditions) -> None:
+        """Keep stated conditions of the next readings, also for the next recording.
 
         Raises:
             OutputError: If the journal cannot be written.
         """
-        self.journal.append({"temperature_C": temperature})
-        self.temperature = temperature
+        self.journal.append(conditions.stated)
+        self.following = NextConditions(**self.following.stated | conditions.stated)
 
     def empty(self, index: int) -> None:
         """Delete all readings of a row's setup, with all that was typed; the journal has them.
@@ -575,7 +394,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
-        past = _read_lines(journal)
+        past = read_lines(journal)
         closed, lines = past.closed, past.lines
         if _is_outdated(session):  # another process may have written before the lock
             session = load_plan(path, wrong=wrong)
@@ -584,9 +403,9 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         if session.readings_path is None:
             session = load_plan(path, wrong=wrong)
         table = read_file(csv, error=SessionError)
-        pending, edited = _find_pending(lines, _digest(table))
+        pending, edited = find_pending(lines, _digest(table))
         present = [change for _, change in lines[: len(lines) - len(pending)]]
-        rows = _recorded_rows(session.readings, [*closed, *present])
+        rows = recorded_rows(session.readings, [*closed, *present])
         for where, change in pending:
             try:
                 rows = change_rows(rows, change)
@@ -601,8 +420,8 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             rows,
             journal,
             _digest(table),
-            _find_dropped(session, [*closed, *(change for _, change in lines)]),
-            past.temperature,
+            find_dropped(session, [*closed, *(change for _, change in lines)]),
+            past.following,
             len(pending),
             edited,
             wrong,
@@ -611,22 +430,6 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             yield recording
         finally:
             recording.close()
-
-
-def _find_dropped(session: Session, changes: Iterable[Change]) -> dict[int, list[ReadingKey]]:
-    """Keys of the deleted rows by line, unless their setup or posture was deleted since.
-
-    Args:
-        session: The session.
-        changes: All changes that the journal contains.
-    """
-    _, dropped = _replay(changes)
-    postures = {None, *session.postures}
-    return {
-        line: keys
-        for line, keys in dropped.items()
-        if all(k[0] in session.setups and postures.issuperset(k[1:3]) for k in keys)
-    }
 
 
 def _files_to_add(session: Session) -> dict[Path, bytes]:
@@ -683,56 +486,3 @@ def _table(rows: Sequence[Reading], session: Session) -> bytes:
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _read_lines(journal: Journal) -> _Past:
-    """Content of a journal; a new one gets its header."""
-    temperature = None
-    closed: list[_JournalLine] = []
-    lines: list[tuple[str, _JournalLine]] = []
-    has_header = False
-    for where, data in journal.entries():
-        if not has_header and (data is None or data.get("format") != FORMAT):
-            raise OrthocalError(
-                "is not the journal of a recording; move it away, and the readings count as they "
-                "are",
-                where=str(journal.path),
-            )
-        if data == CLOSED:
-            closed += [line for _, line in lines]
-            lines.clear()
-        elif has_header:
-            try:
-                if data is not None and data.keys() == {"temperature_C"}:
-                    noted = validate(_Temperature, data, where=where, error=OrthocalError)
-                    temperature = noted.temperature
-                    continue
-                line = validate(_JournalLine, data, where=where, error=OrthocalError)
-            except OrthocalError:
-                raise OrthocalError(
-                    "is not a line of a recording: the journal is damaged; move it away, and the "
-                    "readings count as they are",
-                    where=where,
-                ) from None
-            lines.append((where, line))
-        has_header = True
-    if not has_header:
-        journal.append({"format": FORMAT})
-    return _Past(closed, lines, temperature)
-
-
-def _find_pending(
-    lines: Sequence[tuple[str, _JournalLine]], digest: str
-) -> tuple[Sequence[tuple[str, _JournalLine]], bool]:
-    """Changes that the CSV does not contain yet, and whether the CSV was edited since.
-
-    Args:
-        lines: Places and lines of the journal.
-        digest: Digest of the CSV.
-    """
-    if not lines or lines[-1][1].after == digest:
-        return [], False
-    for i in range(len(lines) - 1, -1, -1):
-        if lines[i][1].before == digest:
-            return lines[i:], False
-    return [], True

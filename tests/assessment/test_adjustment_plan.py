@@ -242,6 +242,8 @@ def test_an_unknown_adjustment_is_named(machines):
     for among in (["w_foot"], [foot, "w_foot"]):
         with pytest.raises(ParameterError, match=r"among: 'w_foot' is not .*; adjustments: "):
             plan_adjustments(calibration, among=among)
+    with pytest.raises(ParameterError, match="among: names no adjustment"):
+        plan_adjustments(calibration, among=[])
 
 
 def test_validation_expects_the_adjusted_machine(plan, machines, plans):

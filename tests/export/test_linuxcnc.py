@@ -363,6 +363,7 @@ def test_rounded_up():
         ),
         (["--within", "1"], 2, "--within: is an option of a kinematics module, and the"),
         (["--to", "yaml", "--tool", "0,0,0"], 2, "--tool: is an option of --to linuxcnc only"),
+        (["--to", "yaml", "--ini", "a.ini"], 2, "--ini: is an option of --to linuxcnc only"),
         (
             ["--to", "yaml", "--offsets"],
             2,

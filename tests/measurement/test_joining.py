@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import gather_sessions, join_sessions
+from orthocal.session.points import base_name
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -85,6 +87,12 @@ def test_a_session_and_one_joined_from_it_do_not_count_twice(sweep, raw_cycles):
             gather_sessions(both)
     others = joined.with_values(joined.values + 1e-6)
     assert gather_sessions([joined, others]) == [joined, others]
+
+
+def test_brackets_in_names_of_directories_are_replaced(sweep):
+    """Brackets name the coordinates of points: all setups of a session would count as one."""
+    joined = join_sessions([replace(sweep, path=Path(f"a[{k}]/session.yaml")) for k in (1, 2)])
+    assert len(set(map(base_name, joined.setups))) == len(joined.setups) == 2 * len(sweep.setups)
 
 
 def test_the_same_readings_again_halve_the_variance(raw_cycles):

@@ -22,6 +22,7 @@ from orthocal.measurement.files import session_file
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
+from orthocal.measurement.recording_journal import NextConditions
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.session.session import Conditions
 from orthocal.units import MM
@@ -205,10 +206,10 @@ def test_deleted_rows_and_the_temperature_are_known_to_the_next_recording(plan):
         r.drop(1)  # line 3, with a typed approach
         r.drop(2)  # line 5
         r.restore(5)  # line 14
-        r.note_temperature(21.0)
-        r.note_temperature(22.5)
+        r.note(NextConditions(temperature=21.0, clock=False))
+        r.note(NextConditions(temperature=22.5))
     with open_recording(plan) as r:
-        assert r.temperature == 22.5
+        assert r.following == NextConditions(temperature=22.5, clock=False)
         assert [line for line in range(20) if r.is_deleted(line)] == [3]
         assert [r.present_line(line) for line in (3, 5, 6)] == [None, 14, None]
         index = r.restore(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import plans
@@ -24,7 +25,14 @@ from orthocal import (
 from orthocal.assessment.controller_entries import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.output.report.page import build_report
-from orthocal.output.text.answer import LISTED, MORE, MOST_LISTED, name_values, render_answer
+from orthocal.output.text.answer import (
+    LISTED,
+    MORE,
+    MOST_LISTED,
+    name_values,
+    next_session,
+    render_answer,
+)
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import render_calibration
 from orthocal.output.text.tables import RECOMMENDING
@@ -290,3 +298,16 @@ def test_notebook_and_report_show_the_same_answer(answers):
 def test_an_answer_without_heading_is_the_rest_of_it(answers):
     whole = to_text(Group(render_answer(answers["raw-cycles"])))
     assert whole.endswith(to_text(render_answer(answers["raw-cycles"], heading=False)))
+
+
+@pytest.mark.parametrize(
+    ("session", "new"), [("mill/first", "mill/second"), ("mill/other", "mill/other-again")]
+)
+def test_the_next_session_is_named_after_the_last_one(answers, session, new):
+    calibration = answers["full"]
+    record = replace(calibration.session, path=f"{session}/session.yaml")
+    named = replace(calibration, session=record)
+    saved = Path("mill/first-calibration")
+    assert next_session(named, saved) == Path(new)
+    unknown = replace(calibration, session=replace(record, path=None))
+    assert next_session(unknown, saved) == Path("mill/first-calibration-again")

@@ -27,7 +27,8 @@ from orthocal.calibration.identify import identify
 from orthocal.errors import CalibrationFileError, SessionError
 from orthocal.measurement.importing.import_readings import TableOptions
 from orthocal.measurement.joining import join_sessions, split_sessions
-from orthocal.measurement.recording import SUFFIX, Change, open_recording
+from orthocal.measurement.recorded_rows import Change
+from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.observation.observations import build_observations
 from orthocal.session.session import Conditions
 from orthocal.statistics.noise import estimate_repeatability

@@ -133,6 +133,10 @@ def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root):
         (["linearisation", "--largest-mm", "0"], "--largest-mm: found 0; expected a number"),
         (["linearisation", "--sigma-mm", "-1"], "--sigma-mm: found -1; expected a number"),
         (["linearisation", "--max-mm", "400"], "x_max"),
+        (
+            ["linearisation", "examples/raw-cycles", "--min-mm", "-5"],
+            "--min-mm: is for a robot; found a session",
+        ),
         (["linearisation", "--max-mm", "-4"], "--max-mm: found -4; expected a number"),
         (["accuracy", "orthoglide"], "orthoglide: is a robot; expected a session.yaml, which"),
         (["linearisation", "tests/robots/biglide"], "biglide: has no legs x, y, z along"),

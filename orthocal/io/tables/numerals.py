@@ -203,12 +203,12 @@ def parse_typed_point(text: str) -> Array:
         SessionError: If the text is not three numbers.
     """
     for separator in (";", None, ","):
-        parts = [part.strip() for part in text.strip().rstrip(";,").split(separator)]
-        if len(parts) == 3:
+        parts = [part.strip().rstrip(",") for part in text.strip().rstrip(";,").split(separator)]
+        if len(parts) == 3 and all(parts):
             break
     else:
         raise SessionError(
             f"'{shorten(text.strip())}' is no point; expected x, y and z in mm with blanks between "
             "them, such as 1.25 -3.5 40"
         )
-    return np.array([parse_typed_reading(part.rstrip(",")) for part in parts])
+    return np.array([parse_typed_reading(part) for part in parts])

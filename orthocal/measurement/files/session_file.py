@@ -19,7 +19,7 @@ from orthocal.effects.adjustment import require_adjustment
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import load_robot, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
-from orthocal.io.documents import describe_missing, read_yaml, validate
+from orthocal.io.documents import describe_missing, missing_keys_error, read_yaml, validate
 from orthocal.io.files import (
     content_withheld_outside,
     exists,
@@ -345,19 +345,31 @@ _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
 
 
 def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
-    """Keys and sensor of each setup."""
+    """Keys and sensor of each setup.
+
+    Raises:
+        SessionError: If a key is wrong, or keys are missing; names all missing ones.
+    """
     gauges = keys.named_gauges
     single_gauge = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
-    setups = {}
+    setups, missing = {}, list[str]()
     for name, data in keys.setups.items():
         gauge_name = data.get("gauge")
         gauge = single_gauge
         if isinstance(gauge_name, str):
             gauge = gauges.get(gauge_name, single_gauge)
         defaults = gauge.model_dump(include={"tip", "scale_tolerance"}, exclude_none=True)
-        setups[name] = read_setup(
-            data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=defaults
-        )
+        under = f"setups.{name}"
+        try:
+            setups[name] = read_setup(
+                data, where=str(file), under=under, error=SessionError, gauge=defaults
+            )
+        except SessionError as e:
+            if not e.missing:
+                raise
+            missing += e.missing
+    if missing:
+        raise missing_keys_error(missing, str(file), SessionError)
     return setups
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from rich.console import Group, RenderableType
@@ -46,6 +47,9 @@ from orthocal.output.text.layout import (
 from orthocal.session.session import split_label
 from orthocal.text import quote_path
 from orthocal.units import DRIVE_UNITS, show_limit, tidy
+
+NEXT_NAMES = dict(pairwise(("first", "second", "third", "fourth", "fifth", "sixth")))
+"""Directory of a session, mapped to that of the next one."""
 
 UNCHANGED = "unchanged"
 """Backlash of the controller that keeps its value."""
@@ -236,7 +240,8 @@ def _next_step(
         return "write settings for the firmware; its README says what to expect.", (
             f"orthocal export {directory} --to {firmware.firmware} --out {new}",
         )
-    directory, new, module = (quote_path(p) for p in (saved, f"{saved}-again", f"{saved}-linuxcnc"))
+    paths = (saved, next_session(calibration, saved), f"{saved}-linuxcnc")
+    directory, new, module = (quote_path(path) for path in paths)
     if gains_from_correction(calibration) and (unchanged or calibration.measured_again):
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
@@ -265,6 +270,15 @@ def _next_step(
         f"orthocal record {new}",
         f"orthocal validate {directory} {new}",
     )
+
+
+def next_session(calibration: Calibration, saved: Path) -> Path:
+    """Directory of the next session, beside a calibration; named after the last session."""
+    last = (calibration.session.parts or (calibration.session,))[-1].path
+    if last is None:
+        return Path(f"{saved}-again")
+    name = Path(os.path.abspath(last)).parent.name
+    return saved.parent / NEXT_NAMES.get(name, f"{name}-again")
 
 
 def gains_from_correction(calibration: Calibration) -> bool:

@@ -26,7 +26,8 @@ from orthocal.measurement.motion.approach import (
 )
 from orthocal.measurement.motion.guidance import guide, set_dial
 from orthocal.measurement.motion.motion import plan_motion
-from orthocal.measurement.recording import RecordedReading, Recording
+from orthocal.measurement.recorded_rows import RecordedReading
+from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
@@ -83,23 +84,24 @@ class RecordingText:
             robot, None, "p"
         )
 
-    def question(self, condition: str, temperature: float | None) -> str:
+    def question(self, condition: str, temperature: float | None, approach: str) -> str:
         """Question for a condition of the next readings.
 
         Args:
             condition: "approach" or "temperature".
             temperature: That of the readings before, [°C].
+            approach: Approach that Enter accepts.
         """
         if condition == "temperature":
             keep = "leaves it open" if temperature is None else f"keeps {temperature:g} °C"
             return f"Temperature of the machine in °C? Enter {keep}. `t 22.5` changes it later."
-        programmed = self.programmed_approach
-        arrow = describe_approach(self._session.robot, programmed)
+        usual = approach == self.programmed_approach
         drives = ", ".join(d.name for d in self._session.robot.drives)
         return (
             f"From which side are the postures approached? One letter for each of {drives}, or "
             "one for all: p if its drive coordinate grows at the end, n if it falls, u if unknown. "
-            f"Enter: {programmed} ({arrow}), as the programs do. `side n` changes it later."
+            f"Enter: {approach} ({describe_approach(self._session.robot, approach)}), "
+            f"as {'the programs do' if usual else 'typed before'}. `side n` changes it later."
         )
 
     def conditions(self, conditions: Conditions, *, alone: bool) -> str:
@@ -109,13 +111,18 @@ class RecordingText:
             conditions: The conditions.
             alone: Whether they are not noted with the next readings, too.
         """
-        noted = []
-        if conditions.approach is not None:
-            noted.append(f"approach {self._side(conditions.approach)}")
-        if conditions.temperature is not None:
-            noted.append(f"{conditions.temperature:g} °C")
+        noted = ", ".join(self._by_command(conditions).values())
         readings = "this reading only" if alone else "this reading and the next ones"
-        return f"Noted with {readings}: {', '.join(noted) or 'no temperature'}."
+        return f"Noted with {readings}: {noted or 'no temperature'}."
+
+    def _by_command(self, conditions: Conditions) -> dict[str, str]:
+        """Stated approach and temperature, by a command that changes them."""
+        noted = {}
+        if conditions.approach is not None:
+            noted["side n"] = f"approach {self._side(conditions.approach)}"
+        if conditions.temperature is not None:
+            noted["t 20"] = f"{conditions.temperature:g} °C"
+        return noted
 
     def _side(self, approach: str) -> str:
         """Arrows of an approach, and its letters in brackets."""
@@ -161,8 +168,12 @@ class RecordingText:
         )
         return "\n".join(lines).replace(GLUE, " ")
 
-    def introduction(self) -> str:
-        """Number of readings, state of the recording, and how to type readings."""
+    def introduction(self, conditions: Conditions) -> str:
+        """Number of readings, state of the recording, and how to type readings.
+
+        Args:
+            conditions: Conditions of the next readings that an earlier recording states.
+        """
         recording, session, rows = self._recording, self._session, self._recording.rows
         restored = recording.restored
         every, done = recording.count, recording.count - recording.missing_count
@@ -187,11 +198,12 @@ class RecordingText:
             f"{self._what_to_type()} It is stored at once. `help` lists the commands. "
             "Lines are those of the sheet and of readings.csv."
         )
-        if recording.temperature is not None:
-            parts.append(
-                f"Noted with the next readings, as typed before: {recording.temperature:g} °C. "
-                "`t 20` changes it."
-            )
+        parts += [
+            f"Noted with the next readings, as typed before: {noted}. `{change}` changes it."
+            for change, noted in self._by_command(conditions).items()
+        ]
+        if recording.following.clock is False:
+            parts.append(f"{self.clock(on=False)} `clock` changes it.")
         rule = AS_ARROWS_SHOW if any(r.approach for r in rows) else FROM_ONE_SIDE
         parts.append(rule.format(approach_length(session)))
         return "\n".join(self.wrap(part) for part in parts)

@@ -205,7 +205,8 @@ def test_loaded_calibration_makes_the_same_report(calibration, tmp_path):
     loaded = load_calibration(path)
     same = replace(loaded, path=None)
     assert build_short_report(same) == build_short_report(calibration)
-    command = f"orthocal again {tmp_path} --out {tmp_path}-again"
+    new = tmp_path.parent / "experiment-2-again"  # after the name of the session
+    command = f"orthocal again {tmp_path} --out {new}"
     assert f"<code>{command}</code>" in build_short_report(loaded)
 
 

@@ -1,0 +1,184 @@
+"""Rows of a recording and their changes.
+
+An approach is planned, or the operator types it with the reading. The CSV has one column for both.
+The changes state which approaches were typed: they are corrected and deleted with their readings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from orthocal.errors import SessionError
+from orthocal.io.documents import Keys, Number
+from orthocal.measurement.files.session_keys import LARGEST_READING_MM
+from orthocal.sensors.points import Coordinate
+from orthocal.session.points import base_name
+from orthocal.session.session import Conditions, Reading, ReadingKey, Session, known_approach
+from orthocal.units import MM
+
+
+class Change(Keys):
+    """Change of the rows of a recording."""
+
+    done: Literal["read", "emptied", "added", "dropped"]
+    """Kind of change: `read` gives a row its value; `emptied` removes the values of all rows of its
+    setup; `added` appends another row after it; `dropped` deletes it. The three rows of a point
+    change together."""
+    rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
+    """Keys of the row, or of the three rows of a point, then of as many added rows."""
+    reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
+        None
+    )
+    point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
+    """Readings of the three rows of a point."""
+    conditions: Conditions | None = None
+    """Conditions stated with the value; those that are None do not change, except that an approach
+    is planned unless it is stated."""
+    line: int | None = None
+    """Line of a deleted row, by which it can be added again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedReading(Reading):
+    """Row of a recording.
+
+    Args:
+        has_typed_approach: Whether the approach was typed with the reading, and not planned.
+    """
+
+    has_typed_approach: bool = False
+
+    @property
+    def setup_in_file(self) -> str:
+        """Name of the setup in the files; the three setups of a point have one name there."""
+        return base_name(self.setup)
+
+    @property
+    def planned_approach(self) -> str | None:
+        """Approach that the plan states; None if it states none."""
+        return None if self.has_typed_approach else self.approach
+
+    @property
+    def emptied(self) -> RecordedReading:
+        """Row without its reading and all that was typed with it; only the approach is planned."""
+        planned = None if self.conditions is None else self.conditions.approach
+        conditions = Conditions(planned) if planned and not self.has_typed_approach else None
+        return replace(self, value=math.nan, conditions=conditions, has_typed_approach=False)
+
+    def with_reading(self, value: float, stated: Conditions | None) -> RecordedReading:
+        """Row with a reading, [m], and the conditions that are stated with it."""
+        old, new = self.conditions or Conditions(), stated or Conditions()
+        conditions = Conditions(
+            new.approach or old.approach,
+            old.temperature if new.temperature is None else new.temperature,
+            new.time or old.time,
+        )
+        return replace(
+            self,
+            value=value,
+            conditions=None if conditions == Conditions() else conditions,
+            has_typed_approach=new.approach is not None,
+        )
+
+
+def change_rows(rows: Sequence[RecordedReading], change: Change) -> tuple[RecordedReading, ...]:
+    """Rows after a change.
+
+    Raises:
+        SessionError: If a row to change does not exist, or a changed row equals another one.
+    """
+    indices = {row.key: i for i, row in enumerate(rows)}
+    changed = list(rows)
+    count = len(change.rows) // 2 if change.done == "added" else len(change.rows)
+    keys, added = change.rows[:count], change.rows[count:]
+    for key in keys:
+        if key not in indices:
+            raise SessionError(f"there is no row {' '.join(str(k) for k in key if k)}")
+    selected = [indices[key] for key in keys]
+    if change.done == "read":
+        values = change.point_mm or [v for v in (change.reading_mm,) if v is not None]
+        if len(values) != len(selected):
+            raise SessionError("the reading is missing")
+        for index, value in zip(selected, values, strict=True):
+            changed[index] = rows[index].with_reading(value * MM, change.conditions)
+    elif change.done == "emptied":
+        setup = base_name(keys[0][0])
+        changed = [r.emptied if r.setup_in_file == setup else r for r in changed]
+    elif change.done == "dropped":
+        changed = [row for i, row in enumerate(changed) if i not in selected]
+    else:
+        if len(added) != len(keys):
+            raise SessionError("the added row is not named")
+        line = 1 + max(r.line or 0 for r in rows)
+        for setup, posture, minus, cycle, *approach in added:
+            conditions = Conditions(approach[0]) if approach else None
+            new = RecordedReading(setup, posture, minus, cycle, math.nan, conditions=conditions)
+            changed.append(replace(new, line=line))
+    number = Counter(row.key for row in changed)
+    for row in changed:
+        if number[row.key] > 1:
+            raise SessionError(f"{row.label_with_cycle} exists already")
+    return tuple(changed)
+
+
+def _replay(
+    changes: Iterable[Change],
+) -> tuple[set[ReadingKey], dict[int, list[ReadingKey]]]:
+    """Keys of the rows whose approach was typed, and keys without readings of deleted rows by line.
+
+    Args:
+        changes: All changes, the first one first.
+    """
+    typed: set[ReadingKey] = set()
+    dropped: dict[int, list[ReadingKey]] = {}
+    for change in changes:
+        if change.done == "dropped" and change.line is not None:
+            dropped[change.line] = [key[:4] if key in typed else key for key in change.rows]
+        if change.done in ("read", "dropped"):
+            typed.difference_update(change.rows)
+        if change.done == "read" and change.conditions and change.conditions.approach:
+            known = known_approach(change.conditions)
+            places = [key[:4] for key in change.rows]
+            typed.update(place if known is None else (*place, known) for place in places)
+    return typed, dropped
+
+
+def recorded_rows(
+    readings: Sequence[Reading], changes: Iterable[Change]
+) -> tuple[RecordedReading, ...]:
+    """Rows of a session that is recorded.
+
+    Args:
+        readings: The readings as in the CSV.
+        changes: All changes that the journal contains and the CSV has.
+    """
+    typed, _ = _replay(changes)
+    return tuple(
+        RecordedReading(
+            *(r.setup, r.posture, r.minus, r.cycle, r.value, r.line, r.file, r.conditions),
+            has_typed_approach=r.is_read and r.key in typed,
+        )
+        for r in readings
+    )
+
+
+def find_dropped(session: Session, changes: Iterable[Change]) -> dict[int, list[ReadingKey]]:
+    """Keys of the deleted rows by line, unless their setup or posture was deleted since.
+
+    Args:
+        session: The session.
+        changes: All changes that the journal contains.
+    """
+    _, dropped = _replay(changes)
+    postures = {None, *session.postures}
+    return {
+        line: keys
+        for line, keys in dropped.items()
+        if all(k[0] in session.setups and postures.issuperset(k[1:3]) for k in keys)
+    }
