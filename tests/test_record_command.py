@@ -25,7 +25,8 @@ from orthocal.calibration.assessment_record import Place
 from orthocal.cli import recording
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.measurement.files.session_file import load_plan
-from orthocal.measurement.motion.motion import guide, plan_motion
+from orthocal.measurement.motion.guidance import guide
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.output.sheet.page import sheet_files
 from orthocal.robot.loading import packaged_robots

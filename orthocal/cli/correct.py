@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, NamedTuple
 
 from typer import Option
@@ -53,7 +54,10 @@ BLOCK_SIZE = 2**16
 """Number of characters or bytes that are read or written at once."""
 
 LONGEST_COMMENT = 240
-"""Largest number of characters of a comment; LinuxCNC reads lines of 252 bytes."""
+"""Largest number of bytes of a comment's line; LinuxCNC reads lines of 252 bytes."""
+
+BYTES = 3
+"""Largest number of bytes of a character."""
 
 CONDITIONS: tuple[UseCondition, ...] = ("temperature", "payload")
 """Conditions of use of a program; the side of approach follows from its motions."""
@@ -394,8 +398,14 @@ def _with_comments(texts: Iterable[str], comments: Sequence[str]) -> Iterator[st
         head = text[:split]
         if head and not head.endswith("\n"):
             head += line_end
-        lines = "".join(f"; {comment[:LONGEST_COMMENT]}{line_end}" for comment in comments)
+        parts = [part for comment in comments for part in _wrap(comment)]
+        lines = "".join(f"; {part}{line_end}" for part in parts)
         yield f"{head}{lines}{text[split:]}"
+
+
+def _wrap(comment: str) -> list[str]:
+    """Lines of a comment that a controller reads completely."""
+    return wrap(comment, LONGEST_COMMENT if comment.isascii() else LONGEST_COMMENT // BYTES)
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:

@@ -67,7 +67,7 @@ class PlanOptions:
         minutes_per_reading (MINUTES): Duration of a reading.
         criterion (aligned|relative|absolute|worst|A|D): For research: figure to minimise.
             RMS tool error after aligning the workpiece, after shifting it, or absolute; worst tool
-            error; or trace, determinant or largest eigenvalue of the covariance.
+            error; or trace (A) or determinant (D) of the covariance.
         starts (N): For research: number of starts of the search; default: 20000 divided by the
             number of candidate readings, at least 3 and at most 30.
     """

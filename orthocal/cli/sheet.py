@@ -42,6 +42,7 @@ def sheet(
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
+    from orthocal.output.text.layout import counted
 
     options = ProgramOptions(feed, approach_feed, dwell, trigger)
     directory = out or (session if is_folder(session) else session.parent)
@@ -52,7 +53,9 @@ def sheet(
     require_replaceable_results(directory, files, force=force)
     write_files(directory, files)
     count = len(files) - 1
-    programs = f" and {count} programs" if count else "; no programs: the drives control no tool"
+    programs = "; no programs: the drives control no tool"
+    if count:
+        programs = f" and {counted(count, 'program')}"
     put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
     note_beyond_limits(plan, ini)
 

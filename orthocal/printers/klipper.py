@@ -94,10 +94,10 @@ def _read_heights(source: LogText) -> PrinterLog:
     """
     text, where = source.text, source.name
     files = " and ".join(name for name, _ in source.files)
-    sections = _sections(text)
-    probe = _probe_offset(sections, where)
     if runs := list(_RUN.finditer(text)):
-        return _read_run(runs[-1], probe, source.place(runs[-1].start()))
+        begin = runs[-1].start()
+        probe = _probe_offset(_sections_before(text, begin), where)
+        return _read_run(runs[-1], probe, source.place(begin))
     matches = sorted(
         [*_OLD_PROBE.finditer(text), *_NEW_PROBE.finditer(text)], key=lambda m: m.start()
     )
@@ -109,14 +109,17 @@ def _read_heights(source: LogText) -> PrinterLog:
     if steps is not None and matches and _first_saved(text) < matches[-1].start():
         notes.append(f"{len(steps[0])} saved heights are not used: they are older.")
     elif steps is not None:
-        settings = _settings(sections, probe, files)
+        sections = _sections(text)
+        settings = _settings(sections, _probe_offset(sections, where), files)
         return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
-    settings = _settings(sections, probe, files)
     points = np.array([_probed(m, source) for m in matches]).reshape(-1, 3) * MM
+    positions = [m.start() for m in matches]
+    used, of_probings = last_probing(points, positions, source)
+    notes += of_probings
+    sections = _sections_before(text, positions[used.stop - 1] if positions else len(text))
+    settings = _settings(sections, _probe_offset(sections, where), files)
     contacts = [m.re is _NEW_PROBE for m in matches]  # newer versions print the point of contact
     points -= np.outer(contacts, settings.probe)
-    used, of_probings = last_probing(points, [m.start() for m in matches], source)
-    notes += of_probings
     name, keys = _probe_section(sections)
     if "z_offset" not in keys:
         notes.append(unstated_trigger(f"z_offset in [{name}]"))
@@ -199,7 +202,10 @@ def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
             "of heights, distances and parameters as Klipper writes them",
             where=line,
         ) from None
-    return _log_from_steps(pairs, [], distances, settings, steps, line)
+    # heights of the probe follow the manual ones, and all are its z_offset
+    manual = [pair for pair in pairs if pair[0] != pairs[-1][0]]
+    probed = [pair for pair in pairs if pair[0] == pairs[-1][0]]
+    return _log_from_steps(probed, manual, distances, settings, steps, line)
 
 
 def _log_from_steps(
@@ -220,10 +226,12 @@ def _log_from_steps(
         steps: Travel of each carriage per step, shape (3,), [m].
         where: File and line, for messages.
     """
-    notes = []
+    notes, height = list[str](), settings.probe[2]
+    if height and pairs and not pairs[-1][0]:  # METHOD=manual: the nozzle touched the bed
+        settings = replace(settings, probe=(0.0, 0.0, height))
     if manual and any(settings.probe[:2]):
         notes.append(
-            f"{len(manual)} manual heights are not used: the probe is at another place than the "
+            f"Manual heights are not used ({len(manual)}): the probe is at another place than the "
             "nozzle."
         )
     else:
@@ -385,6 +393,12 @@ def _sections(text: str) -> dict[str, dict[str, str]]:
         elif pair := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", bare):
             current[pair[1]] = pair[2]
     return sections
+
+
+def _sections_before(text: str, position: int) -> dict[str, dict[str, str]]:
+    """Settings before a position, as each start prints them; all if those before are incomplete."""
+    before = _sections(text[:position])
+    return before if "stepper_a" in before else _sections(text)
 
 
 def config_lines(settings: DeltaSettings) -> str:

@@ -11,6 +11,7 @@ import base64
 import html
 import json
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -40,6 +41,9 @@ _POLICY = (
 
 FRAME_RATE = 30
 """Frames of the animation per second."""
+
+_IDENTIFIER = re.compile("[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+"""Random identifier of meshcat."""
 
 SMALLEST_CHANGE = 1e-12
 """Changes below this are not animated, [m or 1]."""
@@ -133,7 +137,7 @@ class _Recorder:
             return [self._plain(v) for v in value]
         if isinstance(value, np.generic):
             return value.item()
-        if isinstance(value, str) and len(value) == 36 and value.count("-") == 4:
+        if isinstance(value, str) and _IDENTIFIER.fullmatch(value):
             return self._names.setdefault(value, f"o{len(self._names)}")
         return value
 

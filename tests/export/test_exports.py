@@ -31,6 +31,7 @@ from orthocal import (
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.assessment.wording import MOST_ACTIONS, describe_actions, review
 from orthocal.calibration.assessment_record import Assessment, Decision, Place
+from orthocal.cli.correct import _with_comments
 from orthocal.export.urdf import _correct_origins, _find_twists
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.observation.simulate import load_errors
@@ -213,6 +214,17 @@ def test_a_corrected_program_is_marked_and_not_corrected_again(full, tmp_path):
     assert again.stderr.startswith("orthocal: once.ngc:2: found 'Corrected by orthocal")
     assert not (tmp_path / "twice.ngc").exists()
     assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
+
+
+@pytest.mark.parametrize("name", ["a_slide_of_a_long_name", "机器的滑块一号"])
+def test_comments_are_complete_in_lines_that_a_controller_reads(name):
+    """LinuxCNC reads 252 bytes of a line."""
+    comment = " ".join(f"{name} {k} mm." for k in range(40))
+    (text,) = _with_comments(["%\nG21\n"], ["Corrected.", comment])
+    first, *comments, last = text.splitlines()
+    assert (first, comments[0], last) == ("%", "; Corrected.", "G21")
+    assert " ".join(line.removeprefix("; ") for line in comments[1:]) == comment
+    assert max(len(line.encode()) for line in comments) <= 252
 
 
 def test_unknown_format_is_refused():

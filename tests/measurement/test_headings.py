@@ -98,3 +98,8 @@ def test_a_long_heading_takes_no_time(part):
             read_heading(heading)
             with pytest.raises(SessionError):
                 choose_columns([heading] * 3, {"setup": heading}, where="t")
+
+
+def test_a_column_without_a_cycle_is_refused_with_the_numbered_ones():
+    with pytest.raises(SessionError, match=r"'reading' \(#3\) and 'reading 2' \(#4\)"):
+        choose_columns(["setup", "posture", "reading", "reading 2"], {}, where="t")

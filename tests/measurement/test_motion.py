@@ -41,7 +41,8 @@ from orthocal.measurement.motion.approach import (
     approach_length,
     approach_share,
 )
-from orthocal.measurement.motion.motion import plan_motion, shown_joints
+from orthocal.measurement.motion.guidance import shown_joints
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.output.sheet.page import sheet_files
 from orthocal.session.session import Conditions, Gauge, Reading

@@ -83,6 +83,18 @@ def test_console_lines_of_klipper_old_and_new(probed):
     assert np.abs(np.array(old.settings.homed) - old.carriages - expected).max() < 1e-9
 
 
+def test_settings_of_a_later_start_of_klipper_are_not_those_of_the_probing(probed):
+    """The log of a printer that was calibrated and started again after it was probed."""
+    before = write_settings("klipper", odd()) + "[probe]\nz_offset: 1.5\n"
+    after = write_settings("klipper", nominal()) + "[probe]\nz_offset: 2\n"
+    points = "".join(f"probe at {x},{y} is z={z}\n" for x, y, z in POINTS)
+    expected = probed(before + points)
+    log = probed(before + points + after)
+    assert log.settings == expected.settings
+    assert np.abs(log.carriages - expected.carriages).max() < 1e-12
+    assert probed(before + calculation() + after).settings.probe[2] == pytest.approx(-1.5 * MM)
+
+
 @pytest.mark.parametrize(
     ("firmware", "key"),
     [("klipper", "z_offset"), ("marlin", "M851 Z"), ("reprapfirmware", "G31 Z")],
@@ -143,6 +155,20 @@ def test_a_calculation_in_klippy_log(probed):
     (distance,) = log.distances
     assert distance.length == pytest.approx(74.0 * MM)
     assert distance.carriages == pytest.approx(log.carriages[[1, 0]], abs=1e-12)
+
+
+def test_manual_heights_of_a_calculation_are_those_of_the_nozzle(probed):
+    """They are not used beside a probe at another place; without a probe all are."""
+    probe = "[probe]\nx_offset: 20\nz_offset: 1.5\n"
+    log = probed(probe + calculation())
+    assert len(log.heights) == 3
+    assert "Manual heights are not used (1)" in log.notes[0]
+    assert log.settings.probe == pytest.approx((20.0 * MM, 0.0, -1.5 * MM))
+    assert log.heights == pytest.approx(np.zeros(3))
+    by_hand = calculation().replace("(1.5, (", "(0.0, (")
+    log = probed(probe + by_hand)
+    assert log.settings.probe == pytest.approx((0.0, 0.0, -1.5 * MM))
+    assert log.heights == pytest.approx(np.array([-1.4, -1.5, -1.5, -1.5]) * MM)
 
 
 def test_tables_of_g33_and_grids(probed):

@@ -25,7 +25,8 @@ from orthocal import (
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.calibration.identify import identify
 from orthocal.estimation.tolerance_scale import AS_STATED
-from orthocal.measurement.motion.motion import guide, plan_motion
+from orthocal.measurement.motion.guidance import guide
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.output.sheet.gauge_position import find_gauge_position
 from orthocal.session.session import Gauge
 from orthocal.statistics.chance import confidence_factor

@@ -22,6 +22,7 @@ from calibrated import (
 )
 from effect_plans import effect_plan
 from gauges import exact
+from meshcat.geometry import MeshBasicMaterial, Sphere
 from tolerances import KINEMATICS
 
 from orthocal import calibrate, draw_scene, load_robot, load_session
@@ -41,7 +42,7 @@ from orthocal.output.scene.deviations import (
 from orthocal.output.sheet.page import sheet_files
 from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.viewer import machine as machine_scene
-from orthocal.viewer.scene import FRAME_RATE, round_scale
+from orthocal.viewer.scene import FRAME_RATE, Scene, round_scale
 from orthocal.viewer.shapes import arrow_parts, head_length
 
 
@@ -366,7 +367,7 @@ def test_session_shows_the_nominal_machine_and_the_deviations(raw_cycles):
     assert not links(scene, drawing.SOLID)
     assert not [p for p in scene.nodes if p.startswith(readings.AFTER)]
     worst = max(measure_deviations(raw_cycles), key=lambda d: abs(d.before))
-    assert f"{abs(worst.before) * 1e3:.3f} mm" in scene.headline
+    assert f"{abs(worst.before) * 1e3:.3f} mm in setup {worst.setup}, " in scene.headline
 
 
 def test_plan_shows_the_places_of_the_gauges(root):
@@ -498,6 +499,13 @@ def test_choice_of_what_is_shown_at_first(calibration, scene):
     assert hidden(scene_of(EXPERIMENT_2, show="all")) == set()
     with pytest.raises(ParameterError, match="'everything' is none of readings, tool, all"):
         draw_scene(calibration, show="everything")
+
+
+def test_a_name_like_an_identifier_is_kept():
+    """Of 36 characters with four hyphens."""
+    scene, path = Scene("hyphens"), f"Gauges/{'a-' * 4}{'b' * 20}"
+    scene.add(path, Sphere(1.0), MeshBasicMaterial())
+    assert (len(f"/{path}"), scene.nodes) == (36, (path,))
 
 
 def test_pose_of_a_missing_node_is_an_error(scene):

@@ -154,8 +154,9 @@ def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
     further = " and the mounting of the gauges" if mounting else ""
     return note(
         "no redundancy",
-        f"There are {readings} independent readings for {parameters} possible errors{further}, so "
-        "the result relies on the stated tolerances. Only new readings can check it.",
+        f"There {'is' if readings == 1 else 'are'} {counted(readings, 'independent reading')} for "
+        f"{parameters} possible errors{further}, so the result relies on the stated tolerances. "
+        "Only new readings can check it.",
         independent_readings=float(readings),
         parameters=float(parameters),
     )

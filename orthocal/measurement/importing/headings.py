@@ -429,8 +429,7 @@ def _check_readings(
     for index, heading in readings.items():
         if heading.cycle is None:
             if len(readings) > 1:
-                indices = [i for i, h in readings.items() if h.cycle is None]
-                raise _several_columns(texts, indices, "reading", where)
+                raise _several_columns(texts, list(readings), "reading", where)
             continue
         if heading.cycle < 1:
             raise SessionError(

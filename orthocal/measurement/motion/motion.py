@@ -17,7 +17,6 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError, UnreachablePathError
@@ -35,13 +34,13 @@ from orthocal.measurement.motion.approach import (
     name_approach,
     usual_approaches,
 )
+from orthocal.measurement.motion.guidance import range_of_expected
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import (
-    Contact,
     Sensor,
     ToolPath,
     Triple,
@@ -51,7 +50,7 @@ from orthocal.sensors.protocol import (
     tool_path,
 )
 from orthocal.session.order import order_of_measurement
-from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
+from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM
 
 Role = Literal["alignment", "reading", "subtracted", "return"]
@@ -61,55 +60,6 @@ STEP = 5e-3
 
 MOST_STOPS = 2000
 """Largest number of readings in one plan: two weeks of work."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Guidance:
-    """Joints, tool and contacts of the nominal machine in the postures of a session."""
-
-    joints: dict[str, Array]
-    """Joint coordinates that the controller displays, shape (n_drives,), [m, rad], by posture."""
-    passive: dict[str, Array]
-    """Passive coordinates, shape (n_passive,), [m, rad], by posture."""
-    tool: dict[str, Array]
-    """Tool centre points, shape (3,), [m], by posture; empty for a robot without a tool."""
-    contacts: dict[str, tuple[list[str], Contact]]
-    """Postures in which a gauge is aligned or read, and its contact there, by setup."""
-    aligned_at: dict[str, str]
-    """Alignment postures by setup."""
-
-    def touched(self, setup: str, posture: str) -> Array:
-        """Contact point of a setup's gauge in a posture, shape (3,), [m]."""
-        postures, contact = self.contacts[setup]
-        return np.asarray(contact.points[postures.index(posture)])
-
-
-def guide(session: Session) -> Guidance:
-    """Guidance for the operator who measures a session.
-
-    A controller displays the coordinates that it commands. It adds its active offsets to them
-    without displaying them.
-    """
-    robot = session.robot
-    commanded = drive_table(session) + session.active_offsets
-    closure = nominal_closure(robot)
-    passive = closure.close(commanded, names=list(session.postures))
-    tool: dict[str, Array] = {}
-    if robot.tcp is not None:
-        tool = dict(zip(session.postures, closure.tcp(commanded, passive), strict=True))
-    return Guidance(
-        joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
-        passive=dict(zip(session.postures, passive, strict=True)),
-        tool=tool,
-        contacts=locate_contacts(with_alignment(session)),
-        aligned_at=session.alignment_postures,
-    )
-
-
-def with_alignment(session: Session) -> Session:
-    """Session with an additional reading of each setup in its alignment posture."""
-    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
-    return replace(session, readings=(*session.readings, *extra))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,53 +237,6 @@ def state_path_approaches(session: Session) -> Session:
         for i, r in enumerate(session.readings)
     )
     return replace(session, readings=readings)
-
-
-def dial_zero(gauge: Gauge) -> str:
-    """Text of the reading in the middle of a gauge's range, to which its dial is set, in mm."""
-    return f"{gauge.middle / MM + 0.0:g}"
-
-
-def range_of_expected(session: Session, setup: str, first: Stop) -> tuple[float, float]:
-    """Lowest and highest expected reading within the range of a setup's gauge, [m].
-
-    Differences begin at 0, in the middle of the range.
-
-    Args:
-        session: The session.
-        setup: Name of the setup.
-        first: Its first stop that is not the alignment.
-    """
-    gauge = session.gauges[session.setups[setup].gauge]
-    if first.role == "subtracted":
-        return -gauge.half_range, gauge.half_range
-    return gauge.range or (-np.inf, np.inf)
-
-
-def set_dial(session: Session, setup: str) -> str:
-    """Instruction for setting the gauge zero of a setup."""
-    gauge = session.gauges[session.setups[setup].gauge]
-    if session.setups[setup].zero == "known":
-        return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
-    travel = ""
-    if gauge.range is not None:
-        travel = f", about {gauge.half_range / MM:g} mm"
-    return (
-        f"Set the gauge so that its plunger is pressed in by half of its travel{travel}. Then turn "
-        f"the bezel until the dial shows {dial_zero(gauge)}."
-    )
-
-
-def shown_joints(robot: Robot, drives: ArrayLike) -> Array:
-    """Joint coordinates that the controller displays, shape (..., n_drives), [m, rad].
-
-    Args:
-        robot: The robot.
-        drives: Drive coordinates, shape (..., n_drives), [m, rad].
-    """
-    values = np.asarray(drives, dtype=np.float64)
-    columns = [d.to_joint(values[..., i]) for i, d in enumerate(robot.drives)]
-    return np.stack(columns, axis=-1)
 
 
 Path = Callable[[Array, Array], Array]

@@ -22,7 +22,8 @@ from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import describe_approach
-from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
+from orthocal.measurement.motion.guidance import dial_zero, shown_joints
+from orthocal.measurement.motion.motion import SetupMotion, Stop
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import BallIndicator

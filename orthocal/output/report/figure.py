@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, Generic, Literal, ParamSpec
 
 import matplotlib
@@ -25,6 +26,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array
+from orthocal.output.text.layout import short_names
 
 WIDTH = 7.2
 """Width of a figure, [inch]; 100 pixels per inch on the page."""
@@ -34,6 +36,15 @@ ROW_HEIGHT = 0.17
 
 HEAD_HEIGHT = 0.48
 """Height of title and legend together, [inch]."""
+
+MOST_TICKS = 6
+"""Largest number of intervals between the ticks of a list, which long names make narrow."""
+
+CHARACTER = 0.073
+"""Width of a character of a name below a matrix, [inch]."""
+
+MAX_NAME_IN_MATRIX = 24
+"""Most characters of a name in a matrix."""
 
 PADDING = 0.1
 """Distance of text from the border, [inch]; browsers draw text wider than matplotlib expects."""
@@ -179,13 +190,19 @@ def open_figure(height: float, title: str, *, legend: bool = True) -> Figure:
 
 
 def open_list(
-    title: str, names: Sequence[str], *, height: float = ROW_HEIGHT, share: bool = False
+    title: str,
+    names: Sequence[str],
+    *,
+    remarks: Sequence[str] = (),
+    height: float = ROW_HEIGHT,
+    share: bool = False,
 ) -> tuple[Figure, Axes]:
     """Empty figure with a row for each name.
 
     Args:
         title: The title.
-        names: Names of the rows.
+        names: Names of the rows, which are cut if they are too long.
+        remarks: Text behind each name.
         height: Height of a row, [inch].
         share: Whether there is a narrow second panel at the right.
     """
@@ -195,7 +212,9 @@ def open_list(
     else:
         axes = figure.subplots()
     axes.use_sticky_edges = False  # markers at the end of a band are not cut
-    axes.set_yticks(np.arange(len(names)), names)
+    labels = map("".join, zip_longest(short_names(names), remarks, fillvalue=""))
+    axes.set_yticks(np.arange(len(names)), list(labels))
+    axes.locator_params(axis="x", nbins=MOST_TICKS)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
     axes.grid(True, axis="x")

@@ -274,6 +274,8 @@ def _research(calibration: Calibration) -> str:
 def _correlations(calibration: Calibration) -> str:
     """Plot and table of the correlations."""
     figure = plot_correlations(calibration)
+    if not figure and len(calibration.free) > 1:
+        return paragraph("The correlations are unknown, because the noise of the readings is.")
     if not figure:
         return paragraph("A single parameter has no correlations.")
     pairs = calibration.correlated(above=0.5)

@@ -20,6 +20,8 @@ from orthocal.output.report.figure import (
     AFTER,
     AFTER_LOOK,
     BOUND_LOOK,
+    CHARACTER,
+    MAX_NAME_IN_MATRIX,
     Look,
     draw_legend,
     open_figure,
@@ -28,7 +30,7 @@ from orthocal.output.report.figure import (
     scale_log,
     shade,
 )
-from orthocal.output.text.layout import short_name, typeset
+from orthocal.output.text.layout import short_names, typeset
 from orthocal.robot.parameters import is_offset
 from orthocal.units import MM, show_limit
 
@@ -53,9 +55,6 @@ SIGN_LIMIT, DARK_LIMIT = 0.1, 0.6
 COLOUR_LIMITS = (-1.0, -0.9, -0.7, -0.5, -0.3, -SIGN_LIMIT, SIGN_LIMIT, 0.3, 0.5, 0.7, 0.9, 1.0)
 """Limits between the colours of correlations."""
 
-MAX_NAME_IN_MATRIX = 24
-"""Most characters of a name in the correlation matrix."""
-
 _MIDDLE: Look = {"horizontalalignment": "center", "verticalalignment": "center"}
 
 
@@ -65,12 +64,11 @@ def plot_linearised(calibration: Calibration) -> Figure | None:
     shifts = _linearisation_shifts(calibration)
     if not shifts:
         return None
-    errors = [typeset((p.value - p.linear) * p.edge_factor, 4) for _, p in shifts]
-    names = [
-        f"{short_name(p.name)} ({error} {p.edge_unit})"
-        for (_, p), error in zip(shifts, errors, strict=True)
+    errors = [
+        f" ({typeset((p.value - p.linear) * p.edge_factor, 4)} {p.edge_unit})" for _, p in shifts
     ]
-    figure, axes = open_list("Error of the linearised solution, the largest first", names)
+    title = "Error of the linearised solution, the largest first"
+    figure, axes = open_list(title, [p.name for _, p in shifts], remarks=errors)
     y, sizes = np.arange(len(shifts)), np.array([s for s, _ in shifts])
     axes.hlines(y, 0.0, sizes, color="#888888", linewidth=0.8)
     axes.plot(sizes, y, label="exact − linearised", **AFTER_LOOK)
@@ -93,9 +91,9 @@ def plot_parameters(calibration: Calibration) -> Figure:
     title = "Estimates with 95 % intervals"
     if len(rows) < len(free):
         title += f": {len(rows)} of {len(free)}, offsets, then the best determined"
-    names = [f"{short_name(p.name)}{f' at {p.at_bound} bound' if p.at_bound else ''}" for p in rows]
+    bounds = [f" at {p.at_bound} bound" if p.at_bound else "" for p in rows]
     in_unit = len(rows) <= MAX_IN_DETAIL and len({p.unit for p in rows}) == 1
-    figure, axes = open_list(title, names, share=calibration.prior)
+    figure, axes = open_list(title, [p.name for p in rows], remarks=bounds, share=calibration.prior)
     scale = np.array([p.edge_factor if in_unit else 1.0 / show_limit(p.prior_std) for p in rows])
     y, values = np.arange(len(rows)), np.array([p.value for p in rows]) * scale
     prior = np.array([i for i, p in enumerate(rows) if p.prior], dtype=int)
@@ -146,14 +144,14 @@ def plot_correlations(calibration: Calibration) -> Figure | None:
         return None
     size = np.abs(matrix[np.ix_(finite, finite)] - np.eye(finite.size))
     chosen = np.sort(finite[np.argsort(-size.max(axis=1), kind="stable")[:MAX_CORRELATED]])
-    names = [short_name(calibration.free[i].name, MAX_NAME_IN_MATRIX) for i in chosen]
+    names = short_names([calibration.free[i].name for i in chosen], MAX_NAME_IN_MATRIX)
     title = "Correlations of the estimates"
     if chosen.size < finite.size:
         title += f": the {chosen.size} of {finite.size} parameters with the strongest"
     few, count = chosen.size <= MAX_IN_DETAIL, chosen.size - 1
     side = (0.3 if few else 0.145) * max(count, 2)
     flat = count <= 2
-    below = 0.3 if flat else 0.073 * max(len(n) for n in names)
+    below = 0.3 if flat else CHARACTER * max(len(n) for n in names)
     figure = open_figure(0.2 + side + below, title, legend=False)
     axes = figure.subplots()
     rows, columns = np.tril_indices(count)

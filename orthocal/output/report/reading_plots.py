@@ -15,6 +15,7 @@ from scipy import special
 
 from orthocal.arrays import Array
 from orthocal.assessment.circular_deviation import Circle
+from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.residual_rows import (
     ResidualRow,
@@ -36,7 +37,6 @@ from orthocal.output.report.figure import (
     scale_log,
     shade,
 )
-from orthocal.output.text.layout import short_name
 from orthocal.units import MM, UM
 
 _deviation, _residual, _prediction_error = map(
@@ -85,7 +85,7 @@ def plot_setups(calibration: Calibration) -> Figure:
     title = "Residuals per setup, the worst first"
     if len(names) < len(groups):
         title = f"Residuals per setup: the {len(names)} worst of {len(groups)}"
-    figure, axes = open_list(title, [short_name(n) for n in names], height=2.0 * ROW_HEIGHT)
+    figure, axes = open_list(title, names, height=2.0 * ROW_HEIGHT)
     y = np.arange(len(names))
     shown = []
     for get, shift, label, look in (
@@ -165,7 +165,7 @@ def _row_noun(calibration: Calibration) -> str:
 def _row_names(calibration: Calibration, rows: Sequence[ResidualRow]) -> list[str]:
     """Names of rows: setup, postures, and the cycle if there are several cycles."""
     repeated = any(r.cycle != 1 for r in calibration.residuals)
-    return [short_name(f"{r.label}, cycle {r.cycle}" if repeated else r.label) for r in rows]
+    return [f"{r.label}, cycle {r.cycle}" if repeated else r.label for r in rows]
 
 
 def _thin(count: int) -> NDArray[np.int64]:
@@ -192,7 +192,7 @@ def plot_circle(circle: Circle) -> Figure:
     few = len(circle.angles) <= 72
     for label, values, g, colour, mark in looks:
         radii = np.append(values, values[0]) / UM
-        text = f"{label}: G = {g / UM:.3g} µm"
+        text = f"{label}: G = {um(g)} µm"
         axes.plot(
             closed, radii, mark if few else "-", color=colour, label=text, markersize=3.0, lw=1.0
         )

@@ -17,6 +17,8 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BAND,
     BEFORE,
+    CHARACTER,
+    MAX_NAME_IN_MATRIX,
     PREDICTED,
     Look,
     Plot,
@@ -27,6 +29,7 @@ from orthocal.output.report.figure import (
     plot,
     scale_log,
 )
+from orthocal.output.text.layout import short_names, true_minus
 from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.study.bootstrap import BootstrapSummary
@@ -38,7 +41,10 @@ from orthocal.units import UM
 GREY = "#777777"
 
 SMALLEST_DRAWN_MM = 1e-4
-"""Smallest error on a logarithmic axis, [mm]."""
+"""Smallest error of the estimates on a logarithmic axis, [mm]."""
+
+SMALLEST_DRAWN_UM = 1e-3
+"""Smallest tool error on a logarithmic axis, [µm]; that of an exact machine is zero."""
 
 MAX_ERRORS = 40
 """Largest number of errors in a plot."""
@@ -57,20 +63,21 @@ def plot_machines(table: StudyTable, predicted: float) -> Figure:
     """
     figure = open_figure(3.2, "Share of machines below a tool error")
     axes = figure.subplots()
-    drawn = [np.ones(1)]
+    drawn = [predicted] if math.isfinite(predicted) else []
     for name, colour, label in (
         ("before_um", BEFORE, "before calibration"),
         ("tool_um", AFTER, "after calibration"),
     ):
         values = np.array(table.columns.get(name, []), dtype=np.float64)
-        values = np.sort(values[np.isfinite(values)])
+        values = np.sort(values[np.isfinite(values)]).clip(min=SMALLEST_DRAWN_UM)
         if values.size:
             share = 100.0 * (np.arange(values.size) + 1) / values.size
             axes.plot(values, share, color=colour, label=label)
-            drawn.append(values)
+            drawn += [values[0], values[-1]]
     if math.isfinite(predicted):
         axes.axvline(predicted, color="black", linestyle=":", label="predicted RMS")
-    scale_log(axes, "x", np.concatenate(drawn[1:] or drawn))
+    scale_log(axes, "x", np.array(drawn or [1.0]))
+    axes.set_ylim(bottom=0.0)
     _finish(figure, axes, "tool error, workpiece aligned [µm]", "machines [%]")
     return figure
 
@@ -138,17 +145,18 @@ def plot_sensitivity(s: SensitivitySummary) -> Figure:
     largest = max(float(np.abs(values).max()), 1e-9)
     decades = 10.0 ** np.arange(math.floor(math.log10(largest)) - 1, math.ceil(math.log10(largest)))
     title = f"Change by one prior standard deviation of each error [µm], {number} errors"
-    figure = open_figure(1.6 + 0.16 * len(s.rows), title, legend=False)
+    columns = short_names([s.parameters[i] for i in chosen], MAX_NAME_IN_MATRIX)
+    below = CHARACTER * max(map(len, columns))
+    figure = open_figure(0.2 + 0.16 * len(s.rows) + below, title, legend=False)
     axes = figure.subplots()
     norm = SymLogNorm(linthresh=decades[0], vmin=-largest, vmax=largest)
     look: dict[str, Any] = {"aspect": "auto", "cmap": "RdBu_r", "interpolation": "nearest"}
     image = axes.imshow(values, norm=norm, **look)
-    rows = [f"{posture}  {output}" for posture, output in s.rows]
+    rows = short_names([f"{posture}  {output}" for posture, output in s.rows])
     axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
-    columns = [s.parameters[i] for i in chosen]
     axes.set_xticks(range(len(columns)), columns, fontsize=6.5, rotation=90)
     ticks = FixedLocator([*-decades[::-1], 0.0, *decades])
-    text = FuncFormatter(lambda v, _: f"{v:+g}" if v else "0")
+    text = FuncFormatter(lambda v, _: true_minus(f"{v:+g}") if v else "0")
     bar = figure.colorbar(image, ax=axes, fraction=0.04, ticks=ticks, format=text)
     bar.minorticks_off()
     return figure
@@ -171,7 +179,8 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
         plan: The plan.
         unit: Unit of its criterion, [m] for a tool error, otherwise 1.
     """
-    figure = open_figure(3.2, "Expected error over measuring time")
+    quantity = "Expected error" if unit == UM else "Criterion"
+    figure = open_figure(3.2, f"{quantity} over measuring time")
     axes = figure.subplots()
     stages = [s for s in plan.curve if s.setups]
     hours, errors = [s.minutes / HOUR for s in stages], [s.error / unit for s in stages]

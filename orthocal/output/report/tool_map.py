@@ -18,8 +18,10 @@ from scipy.interpolate import RectBivariateSpline
 from orthocal.arrays import Array
 from orthocal.assessment.assess import changes_offsets
 from orthocal.assessment.tool_error import ToolAccuracy
+from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
+from orthocal.output.text.layout import true_minus
 from orthocal.units import MM, UM
 
 Field = Literal["now", "entered", "uncertainty"]
@@ -53,10 +55,14 @@ MAX_DEGREE = 4
 COLOURS = "cividis"
 
 LABEL_MARGIN = 0.09
-"""Smallest distance of a label from the border, relative to the side."""
+"""Smallest distance of a label from the border, relative to the shorter side."""
 
 ARROW_LENGTH = 0.85
-"""Length of the longest arrow, relative to the distance between arrows."""
+"""Length of the longest arrow, relative to the smaller distance between arrows."""
+
+
+ARROW_WIDTH = 0.014
+"""Width of the arrows, [inch]."""
 
 
 def _find_grid(points: Array) -> list[Array] | None:
@@ -174,7 +180,7 @@ def _refine(
 def _describe_cut(lines: list[Array], plane: tuple[int, ...], world: tuple[int, ...]) -> str:
     """Position of a plane, such as z = 0 mm."""
     return ", ".join(
-        f"{'xyz'[world[k]]} = {line[line.size // 2] / MM + 0.0:g} mm"
+        f"{'xyz'[world[k]]} = {true_minus(f'{line[line.size // 2] / MM + 0.0:g}')} mm"
         for k, line in enumerate(lines)
         if k not in plane
     )
@@ -200,7 +206,7 @@ def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, cover
     inside = levels[(levels > size.min()) & (levels < size.max())]
     if _is_constant(size):
         ink = _ink(levels, float(size.mean()))
-        text = f"{size.mean():.3g} µm everywhere"
+        text = f"{um(size.mean() * UM)} µm everywhere"
         axes.text(x.mean(), y.mean(), text, color=ink, horizontalalignment="center")
     elif inside.size:
         inks = [_ink(levels, value) for value in inside]
@@ -213,7 +219,7 @@ def _place_labels(
     contours: Sequence[ArrayLike], x: Array, y: Array, covered: Array
 ) -> list[tuple[float, float]]:
     """Label position on each contour, away from border, arrows and other labels."""
-    side = float(x[-1] - x[0])
+    side = float(min(x[-1] - x[0], y[-1] - y[0]))
     places: list[tuple[float, float]] = []
     for vertices in map(np.asarray, contours):
         edges = [vertices[:, 0] - x[0], x[-1] - vertices[:, 0]]
@@ -256,7 +262,7 @@ def _draw_arrows(
     longest = float(np.linalg.norm(in_plane, axis=1).max())
     if longest < NEGLIGIBLE:
         return np.zeros((0, 2))
-    drawn = in_plane * (ARROW_LENGTH * (x[1] - x[0]) / MM / longest)
+    drawn = in_plane * (ARROW_LENGTH * min(x[1] - x[0], y[1] - y[0]) / MM / longest)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / MM
     axes.quiver(
         *points.T,
@@ -266,7 +272,8 @@ def _draw_arrows(
         angles="xy",
         scale_units="xy",
         scale=1.0,
-        width=0.008,
+        units="inches",
+        width=ARROW_WIDTH,
         zorder=2.0,
     )
     along = np.linspace(-0.5, 0.5, 7)[:, None, None]

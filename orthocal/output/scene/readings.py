@@ -315,7 +315,7 @@ def write_headline(measured: Measurement) -> str:
     mean = f", mean of {worst.cycles} cycles" if worst.cycles > 1 else ""
     text = (
         f"{place[0].upper()}{place[1:]} is furthest from "
-        f"{measured.setups[worst.setup].sensor.ideal}: {_mm(worst.before)} mm at gauge "
+        f"{measured.setups[worst.setup].sensor.ideal}: {_mm(worst.before)} mm in setup "
         f"{worst.setup}, {worst.where}{mean}."
     )
     if worst.after is None or measured.largest_after is None:

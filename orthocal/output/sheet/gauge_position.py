@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.measurement.motion.motion import Guidance, SetupMotion
+from orthocal.measurement.motion.guidance import Guidance
+from orthocal.measurement.motion.motion import SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.sensors.tips import Tip
@@ -42,6 +43,10 @@ class GaugePosition:
     """Nominal drive coordinates of the alignment posture, shape (n_drives,), [m, rad]."""
     aligned: int
     """Index of the alignment posture in `contact`."""
+    coordinates: Array
+    """Point of contact in the alignment posture from `origin_name`, shape (3,), [m]."""
+    origin_name: str
+    """Origin of `coordinates`: the tool centre point in the alignment posture."""
     tool_path: Array
     """Tool points of all stops, in order, shape (n, 3); (0, 3) without a tool, [m]."""
     hinge_distances: Array
@@ -103,6 +108,7 @@ def find_gauge_position(
     if rod is not None:
         distances, normals, axes = _locate_on_rod(robot, rod, drives, q, contact)
         lateral_offset = _find_lateral_offset(rod, contact, normals[aligned], axes[aligned])
+    coordinates, origin_name = guidance.contact_point(motion.setup)
     tool_path = np.zeros((0, 3))
     if robot.tcp is not None:
         way = np.array([s.drives for s in motion.stops])
@@ -118,6 +124,8 @@ def find_gauge_position(
         alignment=alignment,
         drives=drives[aligned],
         aligned=aligned,
+        coordinates=coordinates,
+        origin_name=origin_name,
         tool_path=tool_path,
         hinge_distances=distances,
         lateral_offset=lateral_offset,

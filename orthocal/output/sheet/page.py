@@ -14,16 +14,14 @@ from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length, describe_approach
-from orthocal.measurement.motion.motion import (
-    SetupMotion,
-    Stop,
+from orthocal.measurement.motion.guidance import (
     dial_zero,
     guide,
-    plan_motion,
     range_of_expected,
     set_dial,
     shown_joints,
 )
+from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.observation.conditions import needed_conditions
 from orthocal.observation.gauge_noise import usual_difference
@@ -289,7 +287,7 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
     side = name_direction(gauge.contact.direction)
     opposite = name_direction(-gauge.contact.direction)
     place = " ".join(
-        f"{letter}{_number(v / MM, 1)}" for letter, v in zip("XYZ", gauge.point, strict=True)
+        f"{letter}{_number(v / MM, 1)}" for letter, v in zip("XYZ", gauge.coordinates, strict=True)
     )
     contact = ""
     if gauge.rod is not None and gauge.leg is not None:
@@ -312,8 +310,8 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         target = " ".join(gauge.setup.sensor.place).strip()
     return (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
-        f"{opposite}. {contact}In coordinates, from the tool centre point of the machine at its "
-        f"mechanical zero, the contact point is at {place} mm.",
+        f"{opposite}. {contact}In coordinates, from {gauge.origin_name} in this posture, "
+        f"the contact point is at {place} mm.",
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "enter every reading of this setup with the opposite sign.",
     )
@@ -360,7 +358,10 @@ def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> st
             f"The tip comes within {gauge.near_hinge / MM:.1f} mm of the middle of a hinge. Check "
             "that it clears the bearing before you set the gauge zero."
         )
-    low, high = range_of_expected(session, motion.setup, motion.stops[0])
+    low, high = range_of_expected(
+        session.gauges[session.setups[motion.setup].gauge],
+        differences=motion.stops[0].role == "subtracted",
+    )
     beyond = [s for s in motion.stops if s.role == "reading" and not low <= s.expected <= high]
     if beyond:
         texts.append(

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from orthocal.measurement.motion.motion import plan_motion, shown_joints
+from orthocal.measurement.motion.guidance import shown_joints
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Session
 from orthocal.units import DRIVE_UNITS, format_fixed

@@ -153,8 +153,8 @@ def _flatten(content: RenderableType) -> list[str | Table]:
         return [part for inner in content.renderables for part in _flatten(inner)]
     if isinstance(content, Padding):
         return _flatten(content.renderable)
-    if isinstance(content, Text):
-        return [content.plain]
+    if isinstance(content, Text):  # a command is not wrapped
+        return [f"`{content.plain.strip()}`" if content.no_wrap else content.plain]
     if isinstance(content, Table):
         return [content]
     raise TypeError(f"no HTML for a {type(content).__name__}")
@@ -272,11 +272,24 @@ def residual_table(
     return noted(table_of(headers, cells, left=2), *notes, note)
 
 
-def short_name(text: str, longest: int = LONGEST_NAME) -> str:
-    """A name from a file as it can be shown: printable, and not too long."""
+def short_name(text: str, longest: int = LONGEST_NAME, *, head: int | None = None) -> str:
+    """A name from a file as it can be shown: printable, and not too long.
+
+    Args:
+        text: The name.
+        longest: Largest number of characters.
+        head: Number of characters before the gap of a longer name; half of them by default.
+    """
     shown = printable(text)
-    half = longest // 2
-    return shown if len(shown) <= longest else f"{shown[:half]}…{shown[-half + 1 :]}"
+    head = longest // 2 if head is None else head
+    return shown if len(shown) <= longest else f"{shown[:head]}…{shown[head + 1 - longest :]}"
+
+
+def short_names(texts: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
+    """Names of one list, cut where most of them remain distinct."""
+    heads = sorted(range(1, longest - 1), key=lambda head: abs(head - longest // 2))
+    cut = ([short_name(text, longest, head=head) for text in texts] for head in heads)
+    return max(cut, key=lambda names: len(set(names)))
 
 
 def list_places(places: Iterable[tuple[str, str]]) -> str:

@@ -24,7 +24,8 @@ from orthocal.measurement.motion.approach import (
     fill_approach,
     label_reading,
 )
-from orthocal.measurement.motion.motion import guide, plan_motion, set_dial
+from orthocal.measurement.motion.guidance import guide, set_dial
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recorded_rows import RecordedReading
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
@@ -303,8 +304,9 @@ class RecordingText:
         if distances:
             at = f"{distances[aligned] / MM:.1f} mm from the hinge on the slide"
         else:
-            point = ", ".join(format_fixed(v / MM, 1) for v in guidance.touched(setup, aligned))
-            at = f"at ({point}) mm from the tool centre point at the mechanical zero"
+            point, origin = guidance.contact_point(setup)
+            place = ", ".join(format_fixed(v / MM, 1) for v in point)
+            at = f"at ({place}) mm from {origin}"
         return (
             f"Stand: on the {side} side, so that the tip in posture {aligned} touches {at}. Push "
             "the plunger in: the reading must grow. If it falls, enter every reading of this setup "

@@ -248,9 +248,11 @@ def render_fit(calibration: Calibration) -> RenderableType:
     if len(c.gauges) > 1:
         return noted(table, *(f"σ of {g.name}: {mm(g.noise.sigma)} mm" for g in c.gauges))
     row = "a difference" if c.rows_are_differences else "a reading"
-    dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
+    dof = "" if math.isinf(c.dof) else f", {round(c.dof, 1):g} degrees of freedom"
     text = f"σ of {row}: {mm(c.sigma)} mm, {NOISE_SOURCES[noise.source]}{dof}"
-    if c.rows_are_differences and math.isfinite(noise.sigma):
+    if not math.isfinite(noise.sigma):
+        text = f"σ of {row}: {NOISE_SOURCES['unknown']}"
+    elif c.rows_are_differences:
         text += f" (of one reading {mm(noise.sigma)} mm)"
     lines = [text]
     if noise.cycles_dof > 0 and noise.source != "cycles":

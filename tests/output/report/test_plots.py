@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import matplotlib
@@ -15,9 +16,12 @@ from scipy import stats
 
 from orthocal import Choice, calibrate, load_session
 from orthocal.output.report import figure as style
-from orthocal.output.report import parameter_plots, reading_plots
+from orthocal.output.report import parameter_plots, reading_plots, study_plots
+from orthocal.output.report.page import _correlations
 from orthocal.output.text import layout
-from orthocal.output.text.tables import render_readings
+from orthocal.output.text.tables import render_fit, render_readings
+from orthocal.study.bootstrap import BootstrapSummary, Scatter
+from orthocal.study.sensitivity import SensitivitySummary
 from orthocal.units import MM
 
 PLOTS = (
@@ -207,6 +211,33 @@ def test_names_from_files_are_shown_unchanged(table1):
     assert set(names) <= set(texts(parameter_plots.plot_correlations(strange)))
 
 
+def test_long_names_remain_distinct_and_leave_space_for_the_plot(table1):
+    long = "left_front_upper_arm_parallelogram_bar_link_{}".format
+    parameters = tuple(replace(p, name=long(p.name)) for p in table1.parameters)
+    matrix = parameter_plots.plot_correlations.figure(replace(table1, parameters=parameters))
+    assert len(set(row_names(matrix.axes[0]))) == 2
+    names, rows = tuple(map(long, range(6))), tuple((long(i), "yx") for i in range(12))
+    changes = np.ones((12, 6)) * MM
+    summary = SensitivitySummary(rows, names, ("mm/mm",) * 6, changes, changes)
+    figure = study_plots.plot_sensitivity.figure(summary)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert len({t.get_text() for t in axes.get_xticklabels()}) == 6
+    assert axes.get_position().height * figure.get_figheight() > 12 * 0.1  # rows of readable names
+    scatter = [Scatter(SimpleNamespace(name=n), *[MM] * 7) for n in names]
+    figure = study_plots.plot_bootstrap.figure(BootstrapSummary(10, MM, tuple(scatter), None))
+    assert max(map(len, row_names(figure.axes[0]))) == layout.LONGEST_NAME
+
+
+def test_tool_errors_of_exact_machines_and_their_prediction_are_on_the_axis():
+    table = SimpleNamespace(columns={"before_um": [0.0, 0.0], "tool_um": [3.0, np.nan]})
+    (axes,) = study_plots.plot_machines.figure(table, 70.0).axes
+    low, high = axes.get_xlim()
+    assert 1e-5 < low < line(axes, "before")[0].min()
+    assert high > 70.0
+    assert axes.get_ylim()[0] == 0.0
+
+
 def test_residuals_are_listed_before_and_after_the_worst_first(table1):
     figure = reading_plots.plot_residuals.figure(table1)
     axes = figure.axes[0]
@@ -279,6 +310,11 @@ def test_plots_of_many_readings_stay_small(many):
     for name in ("residuals", "setups", "spread"):
         plot = getattr(reading_plots, f"plot_{name}")
         assert len(plot(many)) < LARGEST
+
+
+def test_an_unknown_noise_is_named_once(unknown):
+    assert "correlations are unknown, because the noise" in _correlations(unknown)
+    assert layout.to_text(render_fit(unknown)).rstrip().endswith("σ of a difference: unknown")
 
 
 def test_cycles_are_named_where_there_are_some(raw, table1):

@@ -206,7 +206,8 @@ def test_loaded_calibration_makes_the_same_report(calibration, tmp_path):
     same = replace(loaded, path=None)
     assert build_short_report(same) == build_short_report(calibration)
     new = tmp_path.parent / "experiment-2-again"  # after the name of the session
-    assert f"orthocal again {tmp_path} --out {new}" in build_short_report(loaded)
+    command = f"orthocal again {tmp_path} --out {new}"
+    assert f"<code>{command}</code>" in build_short_report(loaded)
 
 
 def build_short_report(calibration):

@@ -14,11 +14,12 @@ from matplotlib.colors import to_rgb
 from orthocal import Choice, calibrate, load_plan, simulate_session
 from orthocal.assessment.tool_error import assess_tool
 from orthocal.calibration.identify import identify
-from orthocal.kinematics.workspace import Workspace, cube
+from orthocal.kinematics.workspace import Workspace, box_workspace, cube
 from orthocal.output.report import figure as style
 from orthocal.output.report import tool_map
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Tcp
+from orthocal.units import MM
 
 QUICK = {"solver": "variable-projection"}
 SVG = "{http://www.w3.org/2000/svg}"
@@ -210,16 +211,25 @@ def test_arrows_point_where_the_tool_is_off_to(table1, accuracy):
     np.testing.assert_allclose(vector[:, 1] * 40.0, place[:, 0] * vector.max(), atol=GRID)
 
 
+def test_arrows_and_labels_of_a_flat_workspace_are_inside(table1):
+    box = np.array([[-60, 60], [-10, 10], [-60, 60]]) * MM
+    figure = draw(table1, assess_tool(table1, box_workspace(table1.robot, box)), "now")
+    place, vector = arrows(figure.axes[0])  # across the flat side
+    assert np.abs(place[:, 1] + 0.5 * vector[:, 1]).max() < 10.0
+    assert np.linalg.norm(vector, axis=1).max() < 20.0 / 3.0
+    assert figure.axes[0].texts
+
+
 def test_uncertainty_has_no_arrows(table1, accuracy):
     for axes in draw(table1, accuracy, "uncertainty").axes[:3]:
         assert not [c for c in axes.collections if hasattr(c, "U")]
 
 
-@pytest.mark.parametrize("size", [0.0, 1e6])
-def test_a_constant_error_is_printed_as_a_number(table1, accuracy, size):
+@pytest.mark.parametrize(("size", "number"), [(0.0, "0.0"), (1e6, "1000000")])
+def test_a_constant_error_is_printed_as_a_number(table1, accuracy, size, number):
     same = with_error(accuracy, lambda x, y, z: (0.0 * x, 0.0, size))
     shown = texts(tool_map.plot_tool_map(table1, same, which="now"))
-    assert shown.count(f"{size:.3g} µm everywhere") == 3
+    assert shown.count(f"{number} µm everywhere") == 3
 
 
 def test_labels_of_levels_differ_however_little_the_error_does(table1, accuracy):

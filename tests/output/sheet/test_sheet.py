@@ -125,6 +125,24 @@ def test_stated_contact_is_on_the_rod(small, page):
     assert "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from" in text
 
 
+def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
+    """On the centre line of leg x, which is 125 mm from the slide in the mechanical zero."""
+    setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="<out>")}
+    page = etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"])
+    text = next(words(s) for s in sections(page) if words(s.find("h2")).endswith(": zx"))
+    drives = small.postures["<out>"].drives
+    root, tip, tool = (
+        place(small.robot, drives, frame) for frame in ("x_leg_root", "x_leg_tip", "tcp")
+    )
+    at_zero = place(small.robot, small.robot.drive_zero, "x_leg_root")
+    share = (root[0] - (at_zero[0] - 0.125)) / (root[0] - tip[0])
+    expected = root + share * (tip - root) - tool
+    found = re.search(r"contact point is at X([-\d.]+) Y([-\d.]+) Z([-\d.]+) mm", text)
+    assert [float(v) for v in found.groups()] == pytest.approx(expected / MM, abs=ROUNDED_PLACE)
+    assert "from the tool centre point in this posture" in text
+    assert np.linalg.norm(tool) > 0.01
+
+
 def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
