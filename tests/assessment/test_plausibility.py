@@ -11,6 +11,7 @@ import numpy as np
 import plans
 import pytest
 from calibrated import calibrated, plan_of, session_of
+from effect_plans import effect_plan
 from gauges import with_gauges
 from machines import write_orthoglide
 from models import TRUTH
@@ -24,9 +25,10 @@ from orthocal.assessment.plausibility import (
     find_implausible,
     find_impossible_gauges,
 )
-from orthocal.assessment.words.effects import approach_incomplete
+from orthocal.assessment.words.effects import condition_incomplete
 from orthocal.assessment.words.plausibility import outstanding_error
 from orthocal.calibration.file import calibration_json
+from orthocal.effects.loading import measurable_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.output.text.answer import describe_machine
@@ -345,6 +347,7 @@ def test_an_error_of_a_mounting_may_be_a_wrong_reading(name, advice):
 
 @pytest.mark.parametrize(("two", "advice"), [(False, "Complete the column"), (True, "Differences")])
 def test_differences_of_two_postures_cannot_state_an_approach(two, advice):
-    found = approach_incomplete([3, 4], 2, 9, two_postures=two)
+    (effect,) = measurable_effects(effect_plan("backlash").robot)
+    found = condition_incomplete(effect, "approach", [3, 4], 2, 9, two_postures=two)
     assert found.text.startswith("2 of 9 readings (lines 3, 4) do not state")
     assert found.action.startswith(advice)
