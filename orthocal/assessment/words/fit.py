@@ -133,19 +133,21 @@ def gauge_overstated(sigma: float, stated: float, of_gauge: str) -> Finding:
     )
 
 
-def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
+def no_redundancy(readings: int, parameters: int, *, mounting: bool, again: bool) -> Finding:
     """Finding that the fit has no redundant readings.
 
     Args:
         readings: Number of independent readings.
         parameters: Number of free errors of the machine.
         mounting: True if further readings determine only the mounting of gauges.
+        again: True if readings after a change of the offsets are among them.
     """
     further = " and the mounting of the gauges" if mounting else ""
+    check = "" if again else " Only new readings can check it."
     return note(
         "no redundancy",
         f"There are {readings} independent readings for {parameters} possible errors{further}, so "
-        "the result relies on the stated tolerances. Only new readings can check it.",
+        f"the result relies on the stated tolerances.{check}",
         independent_readings=float(readings),
         parameters=float(parameters),
     )

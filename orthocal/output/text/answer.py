@@ -10,12 +10,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import expanded_uncertainty, lowers, readings_limit
+from orthocal.assessment.assess import assessment_of, gains_from_correction
+from orthocal.assessment.controller_entries import expanded_uncertainty, readings_limit
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import (
+    CHOICE_STEP,
     describe_compensated,
     describe_region,
     describe_use_parts,
@@ -44,7 +45,7 @@ from orthocal.output.text.layout import (
     table_of_records,
 )
 from orthocal.session.session import split_label
-from orthocal.text import quote_path
+from orthocal.text import quote_path, uncapitalised
 from orthocal.units import DRIVE_UNITS, show_limit, tidy
 
 UNCHANGED = "unchanged"
@@ -237,13 +238,11 @@ def _next_step(
             f"orthocal export {directory} --to {firmware.firmware} --out {new}",
         )
     directory, new, module = (quote_path(p) for p in (saved, f"{saved}-again", f"{saved}-linuxcnc"))
-    if gains_from_correction(calibration) and (unchanged or calibration.measured_again):
+    gains = gains_from_correction(calibration, assessment.tool)
+    if gains and (unchanged or calibration.measured_again):
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
-            words = (
-                "choose one: enter these offsets; or leave the present ones, and correct all "
-                "identified errors in LinuxCNC or in programs."
-            )
+            words = uncapitalised(CHOICE_STEP)
         active = "" if unchanged else " --offsets active"
         home = quote_path(f"{saved}-home")
         offsets = f"orthocal export {directory} --to linuxcnc --offsets --ini FILE --out {home}"
@@ -264,14 +263,6 @@ def _next_step(
         f"orthocal again {directory} --out {new}",
         f"orthocal record {new}",
         f"orthocal validate {directory} {new}",
-    )
-
-
-def gains_from_correction(calibration: Calibration) -> bool:
-    """True if correcting all identified errors lowers the tool error beyond entered offsets."""
-    tool = assessment_of(calibration).tool
-    return (
-        not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
     )
 
 
