@@ -177,7 +177,8 @@ def find_warnings(session: Session) -> tuple[Finding, ...]:
         RobotError: If the closures of the robot depend on each other.
     """
     mistakes, _ = _find_mistakes(session)
-    return rank([*mistakes, *(() if mistakes else find_finer(session))])
+    finer = [] if mistakes else [f for f in find_finer(session) if f.severity != "note"]
+    return rank([*mistakes, *finer])
 
 
 def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:

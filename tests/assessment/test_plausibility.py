@@ -17,11 +17,12 @@ from machines import write_orthoglide
 from models import TRUTH
 
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
-from orthocal.assessment.judgement import judge_session
+from orthocal.assessment.judgement import find_warnings, judge_session
 from orthocal.assessment.plausibility import (
     _check_distances,
     _legs,
     describe_legs,
+    find_finer,
     find_implausible,
     find_impossible_gauges,
 )
@@ -67,6 +68,20 @@ def test_readings_in_inches_are_found(session):
     assert [f.kind for f in found] == ["wrong unit"]
 
 
+def test_few_readings_between_the_steps_are_a_note_unless_all_of_a_setup():
+    """A setup in inches, whose small readings agree with the machine all the same."""
+    session = session_of("workshop")
+    of_setup = np.array([r.setup == next(iter(session.setups)) for r in session.readings])
+    rows = np.flatnonzero(of_setup)[1:]
+    few, inches = session.values, session.values
+    few[rows] += 3e-6
+    inches[of_setup] = np.round(inches[of_setup] / 25.4, 7)
+    for values, severity, count in ((few, "note", 2.0), (inches, "review", 3.0)):
+        (finer,) = find_finer(session.with_values(values))
+        assert (finer.severity, finer.numbers["readings_between_steps"]) == (severity, count)
+    assert not [f for f in find_warnings(session.with_values(few)) if f.severity == "note"]
+
+
 def test_small_readings_in_metres_are_found():
     """None of them is a hundredth of a step of the gauge."""
     errors = {name: 0.1 * error for name, error in TRUTH.items()}
@@ -82,7 +97,8 @@ def test_small_readings_in_metres_are_found():
 def test_some_means_of_cycles_may_be_finer_than_the_dial(session):
     values = session.values.copy()
     values[::4] += 3e-6
-    assert kinds(session.with_values(values)) == []
+    found = find_implausible(session.with_values(values))
+    assert [(f.kind, f.severity) for f in found] == [("finer than the gauge", "note")]
 
 
 @pytest.mark.parametrize("seed", range(4))
