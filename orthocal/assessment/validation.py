@@ -18,6 +18,7 @@ import numpy as np
 
 from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import (
+    compensation_to_enter,
     entered_offsets,
     expanded_uncertainty,
     find_backlash,
@@ -253,7 +254,10 @@ def validate_calibration(
     entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
-    notes += _describe_comparison(repetition, test, judgement, stated=stated)
+    notes += _describe_comparison(repetition, test, judgement)
+    if not stated:
+        backlash = bool(compensation_to_enter(calibration))
+        notes.append(words.controller_assumed(backlash=backlash))
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
@@ -277,17 +281,13 @@ def validate_calibration(
 
 
 def _describe_comparison(
-    repetition: Repetition, test: DeviationTest, judgement: Judgement, *, stated: bool
+    repetition: Repetition, test: DeviationTest, judgement: Judgement
 ) -> list[Finding]:
-    """Findings about repeated residuals, and about active offsets that no session states.
-
-    That residuals of wrong readings repeat means nothing.
-    """
+    """Finding about repeated residuals. That those of wrong readings repeat means nothing."""
     exceeded = _is_expected(test.p_value) is False
     repeated = words.describe_repetition(repetition, exceeded=exceeded)
     means_nothing = repeated.kind == "residuals repeat" and judgement.verdict != "enter"
-    findings = [] if means_nothing else [repeated]
-    return findings if stated else [*findings, words.controller_assumed()]
+    return [] if means_nothing else [repeated]
 
 
 def _apply_stated(
@@ -406,7 +406,7 @@ def _adjust_to_sessions(calibration: Calibration, sessions: Sequence[Session]) -
 
 
 def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
-    """Session with active offsets: as stated, otherwise as calibrated.
+    """Session with active offsets: as stated; otherwise with all values as calibrated.
 
     Raises:
         SessionError: If it states other offsets than the calibrated ones.
@@ -415,7 +415,9 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     entries = {drives.index(e.drive): e for e in find_entries(calibration)}
     if session.controller_offsets is None:
         stated = entries or calibration.session.controller_offsets is not None
-        return session.with_controller(entered_offsets(calibration)) if stated else session
+        assumed = session.compensation or compensation_to_enter(calibration)
+        entered = replace(session, compensation=assumed)
+        return entered.with_controller(entered_offsets(calibration)) if stated else entered
     differences, where = [], ""
     for i, entry in entries.items():
         active = float(session.active_offsets[i])
