@@ -297,7 +297,7 @@ def _find_outstanding_error(session: Session) -> tuple[Parameter, float] | None:
         squares[list(model.offsets.values())] = 0.0
         places = np.array(
             [
-                name if i < problem.n_machine else ".".join(name.split(".")[:2])
+                name if i < problem.n_machine else _owner_of(name, part.labels[0])
                 for i, name in enumerate(problem.free)
             ]
         )
@@ -307,6 +307,14 @@ def _find_outstanding_error(session: Session) -> tuple[Parameter, float] | None:
             parameter = problem.selection.parameters[largest]
             return parameter, float(theta[largest] * parameter.prior_std)
     return None
+
+
+def _owner_of(name: str, label: str) -> str:
+    """Setup, artefact or gauge of a nuisance parameter in a session with a label, or without ""."""
+    within = name.replace(f"{label}/", "", 1) if label else name
+    if within.startswith("setup."):
+        return within.rpartition(".")[0]
+    return ".".join(within.split(".")[:2])
 
 
 def _independent_contrasts(

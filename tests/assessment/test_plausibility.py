@@ -17,7 +17,7 @@ from machines import write_orthoglide
 from models import TRUTH
 
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
-from orthocal.assessment.judgement import find_warnings, judge_session
+from orthocal.assessment.judgement import _owner_of, find_warnings, judge_session
 from orthocal.assessment.plausibility import (
     _check_distances,
     _legs,
@@ -349,16 +349,30 @@ def test_postures_of_another_session_are_not_too_near(cycles):
     ("name", "advice"),
     [
         ("setup.yx.roll", "Read setup yx again: a wrong reading, such as a dial misread by one"),
+        ("setup.2025.03.14/yx.roll", "Read setup 2025.03.14/yx again:"),
         ("x_slide.offset", "Measure that place or part again."),
     ],
 )
 def test_an_error_of_a_mounting_may_be_a_wrong_reading(name, advice):
     problem = build_problem(session_of("workshop"), model="offsets")
-    (parameter,) = (p for p in problem.parameters if p.name == name)
-    found = outstanding_error(parameter, 0.1)
+    plain = name.replace("2025.03.14/", "")
+    (parameter,) = (p for p in problem.parameters if p.name == plain)
+    found = outstanding_error(replace(parameter, name=name), 0.1)
     assert found.kind == "outstanding error"
     assert found.severity == "reject"
     assert found.action.startswith(advice)
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "owner"),
+    [
+        ("setup.yx.roll", "", "setup.yx"),
+        ("setup.2025.03.14/y.x.roll", "2025.03.14", "setup.y.x"),
+        ("2025.03.14/square.block.long.bow", "2025.03.14", "square.block"),
+    ],
+)
+def test_names_with_dots_keep_the_owners_of_errors_apart(name, label, owner):
+    assert _owner_of(name, label) == owner
 
 
 @pytest.mark.parametrize(("two", "advice"), [(False, "Complete the column"), (True, "Differences")])

@@ -78,11 +78,12 @@ def outstanding_error(parameter: Parameter, error: float) -> Finding:
     action = (
         "Measure that place or part again. If it is so far off, state its true value or a larger "
     )
-    kind, *names = parameter.name.split(".")
-    if kind == "setup" and names:
+    kind, _, name = parameter.name.partition(".")
+    if kind == "setup":
         action = (
-            f"Read setup {names[0]} again: a wrong reading, such as a dial misread by one turn, "
-            "may look the same. If the readings were right, state the true value or a larger "
+            f"Read setup {name.rpartition('.')[0]} again: a wrong reading, such as a dial misread "
+            "by one turn, may look the same. If the readings were right, state the true value or a "
+            "larger "
         )
     return reject(
         "outstanding error",
