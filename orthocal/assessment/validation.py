@@ -255,9 +255,7 @@ def validate_calibration(
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, judgement)
-    if not stated:
-        backlash = bool(compensation_to_enter(calibration))
-        notes.append(words.controller_assumed(backlash=backlash))
+    notes += [] if stated else [_describe_assumed(calibration)]
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
@@ -288,6 +286,11 @@ def _describe_comparison(
     repeated = words.describe_repetition(repetition, exceeded=exceeded)
     means_nothing = repeated.kind == "residuals repeat" and judgement.verdict != "enter"
     return [] if means_nothing else [repeated]
+
+
+def _describe_assumed(calibration: Calibration) -> Finding:
+    """Finding about calibrated values that are assumed to be active (`_with_active_offsets`)."""
+    return words.controller_assumed(backlash=bool(compensation_to_enter(calibration)))
 
 
 def _apply_stated(
