@@ -253,12 +253,10 @@ def validate_calibration(
     wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
     entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
-    stated = all(one.controller_offsets is not None for one in new)
-    notes += _describe_comparison(repetition, test, judgement)
-    notes += [] if stated else [_describe_assumed(calibration)]
+    notes += _describe_comparison(repetition, test, judgement) + _assumed(calibration, new)
     return Validation(
         confirmed=confirmed,
-        offsets_stated=stated,
+        offsets_stated=_state_offsets(new),
         expected_rms=expected.rms,
         expected_largest=expected.largest,
         excess_probability=test.p_value,
@@ -288,9 +286,15 @@ def _describe_comparison(
     return [] if means_nothing else [repeated]
 
 
-def _describe_assumed(calibration: Calibration) -> Finding:
-    """Finding about calibrated values that are assumed to be active (`_with_active_offsets`)."""
-    return words.controller_assumed(backlash=bool(compensation_to_enter(calibration)))
+def _assumed(calibration: Calibration, new: Sequence[Session]) -> list[Finding]:
+    """Finding about calibrated values that are assumed, unless the sessions state theirs."""
+    backlash = bool(compensation_to_enter(calibration))
+    return [] if _state_offsets(new) else [words.controller_assumed(backlash=backlash)]
+
+
+def _state_offsets(sessions: Sequence[Session]) -> bool:
+    """True if all sessions state the active offsets."""
+    return all(one.controller_offsets is not None for one in sessions)
 
 
 def _apply_stated(
