@@ -176,6 +176,7 @@ def assess(
             findings,
             firmware=firmware,
             backlash=any(e.change for e in chosen.backlash),
+            choice=calibration.measured_again and gains_from_correction(calibration, tool),
         ),
         findings=findings,
         entries=() if firmware else entries,
@@ -194,6 +195,13 @@ def changes_offsets(calibration: Calibration) -> bool:
     """True if offsets are to be entered and other identified errors then remain."""
     firmware = calibration.session.firmware is not None
     return not (calibration.only_offsets or firmware or assessment_of(calibration).keeps_offsets)
+
+
+def gains_from_correction(calibration: Calibration, tool: ToolErrorSummary | None) -> bool:
+    """True if correcting all identified errors lowers the tool error beyond entered offsets."""
+    return (
+        not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
+    )
 
 
 def check_session(session: Session, *, judgement: Judgement | None = None) -> Assessment:
@@ -397,13 +405,16 @@ def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
     return not abs(entry.best_change) <= expanded_uncertainty(calibration, entry)
 
 
-def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> Decision:
+def _decide(
+    findings: Sequence[Finding], *, firmware: bool, backlash: bool, choice: bool
+) -> Decision:
     """Decision by the gravest finding; to enter the values if no finding is against it.
 
     Args:
         findings: All findings, the gravest first.
         firmware: Whether settings of a printer's firmware are calibrated.
         backlash: Whether there is backlash to enter.
+        choice: Whether all identified errors may be corrected in place of the offsets.
     """
     verdict, lead = verdict_of(findings), findings[0]
     headlines = words.FIRMWARE_HEADLINES if firmware else words.HEADLINES
@@ -421,4 +432,6 @@ def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> D
     reason, action = ("", "") if explanation is None else (explanation.text, explanation.action)
     if firmware:
         return Decision(verdict, headlines[verdict], reason, words.FIRMWARE_STEP)
+    if choice:
+        return Decision(verdict, words.CHOICE_HEADLINE, reason, words.CHOICE_STEP)
     return Decision(verdict, headlines[verdict], reason, f"{words.NEXT_STEP} {action}".strip())

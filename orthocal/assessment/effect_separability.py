@@ -26,6 +26,7 @@ from orthocal.effects.loading import (
     neutral_values,
 )
 from orthocal.hypotheses.linear_model import linear_model
+from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
 from orthocal.observation.observations import drive_table, readings_without
 from orthocal.session.session import Conditions, Session
 
@@ -48,51 +49,62 @@ def find_unshown_effects(session: Session) -> list[Finding]:
     """
     if not measurable_effects(session.robot):
         return []
-    findings = [*_unshown_backlash(session), *_unshown_expansion(session)]
+    findings = [
+        *_incomplete_conditions(session),
+        *_unshown_backlash(session),
+        *_unshown_expansion(session),
+    ]
     return [*findings, *_inseparable(session)] if len(session.readings) > 1 else findings
+
+
+def _incomplete_conditions(session: Session) -> Iterator[Finding]:
+    """Findings about readings without a condition that `calibrate` needs (`require_conditions`)."""
+    explicit = session.robot.chosen_effects is not None
+    for effect in measurable_effects(session.robot):
+        for condition in (c for c in COLUMNS_OF_CONDITIONS if c in effect.conditions):
+            missing = readings_without(session, condition)
+            if missing and (explicit or len(missing) < len(session.readings)):
+                one_file = len({r.file for r in missing}) == 1
+                yield words.condition_incomplete(
+                    effect,
+                    condition,
+                    sorted({r.line for r in missing if r.line is not None}) if one_file else [],
+                    len(missing),
+                    len(session.readings),
+                    two_postures=any(r.minus for r in missing),
+                )
 
 
 def _unshown_backlash(session: Session) -> Iterator[Finding]:
     """Finding about drives that all readings approach from one side, or without stated approach."""
     if "backlash" not in session.robot.effect_names:
         return
-    approaches = [r.approach for r in session.readings if r.approach is not None]
-    if not approaches:
-        yield words.approach_not_stated()
+    approaches = {r.approach for r in session.readings}
+    if approaches == {None}:
+        if session.robot.chosen_effects is None:
+            yield words.approach_not_stated()
         return
-    missing = readings_without(session, "approach")
-    if missing:
-        lines = sorted({r.line for r in missing if r.line is not None})
-        yield words.approach_incomplete(
-            lines,
-            len(missing),
-            len(session.readings),
-            two_postures=any(r.minus for r in missing),
-        )
     names = list(session.postures)
     rows_read = sorted({names.index(r.posture) for r in session.readings})
     distance = np.abs(drive_table(session)[rows_read] - session.robot.drive_zero)
     one_sided = {
         drive.name: names[rows_read[int(distance[:, i].argmax())]]
         for i, drive in enumerate(session.robot.drives)
-        if len({letters[i] for letters in approaches} - {"u"}) < 2
+        if {a and a[i] for a in approaches} in ({"p"}, {"n"})
     }
     if one_sided:
-        common = len(approaches) == len(session.readings) and len(set(approaches)) == 1
-        yield words.approached_from_one_side(one_sided, common=common)
+        yield words.approached_from_one_side(one_sided, common=len(approaches) == 1)
 
 
 def _unshown_expansion(session: Session) -> Iterator[Finding]:
-    """Finding about readings that were all taken at one temperature."""
+    """Finding about readings that were all taken at one temperature, or state none."""
     if "thermal" not in session.robot.effect_names:
         return
-    temperatures = {r.conditions.temperature for r in session.readings if r.conditions} - {None}
-    if len(temperatures) < 2:
+    temperatures = {(r.conditions or Conditions()).temperature for r in session.readings}
+    if len(temperatures) == 1 and not (temperatures == {None} and session.robot.chosen_effects):
         setup = session.readings[0].setup
         repeating_helps = _shows_expansion(_read_warmer(session, setup))
-        yield words.one_temperature(
-            next(iter(temperatures), None), setup if repeating_helps else ""
-        )
+        yield words.one_temperature(temperatures.pop(), setup if repeating_helps else "")
 
 
 def _read_warmer(session: Session, setup: str) -> Session:

@@ -81,7 +81,9 @@ def _redundancy(calibration: Calibration) -> list[Finding]:
     if calibration.is_checked:
         return []
     readings, errors = calibration.identifiability.n_readings, len(calibration.free)
-    return [words.no_redundancy(readings, errors, mounting=readings > calibration.structural_rank)]
+    mounting = readings > calibration.structural_rank
+    again = calibration.measured_again
+    return [words.no_redundancy(readings, errors, mounting=mounting, again=again)]
 
 
 def _residuals(calibration: Calibration) -> list[Finding]:

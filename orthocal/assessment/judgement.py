@@ -177,7 +177,8 @@ def find_warnings(session: Session) -> tuple[Finding, ...]:
         RobotError: If the closures of the robot depend on each other.
     """
     mistakes, _ = _find_mistakes(session)
-    return rank([*mistakes, *(() if mistakes else find_finer(session))])
+    finer = [] if mistakes else [f for f in find_finer(session) if f.severity != "note"]
+    return rank([*mistakes, *finer])
 
 
 def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:
@@ -296,7 +297,7 @@ def _find_outstanding_error(session: Session) -> tuple[Parameter, float] | None:
         squares[list(model.offsets.values())] = 0.0
         places = np.array(
             [
-                name if i < problem.n_machine else ".".join(name.split(".")[:2])
+                name if i < problem.n_machine else _owner_of(name, part.labels[0])
                 for i, name in enumerate(problem.free)
             ]
         )
@@ -306,6 +307,14 @@ def _find_outstanding_error(session: Session) -> tuple[Parameter, float] | None:
             parameter = problem.selection.parameters[largest]
             return parameter, float(theta[largest] * parameter.prior_std)
     return None
+
+
+def _owner_of(name: str, label: str) -> str:
+    """Setup, artefact or gauge of a nuisance parameter in a session with a label, or without ""."""
+    within = name.replace(f"{label}/", "", 1) if label else name
+    if within.startswith("setup."):
+        return within.rpartition(".")[0]
+    return ".".join(within.split(".")[:2])
 
 
 def _independent_contrasts(

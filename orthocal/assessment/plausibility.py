@@ -17,6 +17,7 @@ from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.hypotheses.families.unit_and_sign import decimal_steps
+from orthocal.hypotheses.hypothesis import group_rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.observation.gauge_noise import noise_floor
 from orthocal.robot.model import Robot
@@ -120,7 +121,7 @@ def find_impossible_gauges(session: Session) -> Iterator[Finding]:
                 len(rows), step, coarser, keys, noise_stated=bool(sigma)
             )
         finer = _finer_rows(session, rows, gauge)
-        if finer and (
+        if len(finer) * 2 >= len(rows) and (
             step > WRONG_UNIT_RATIO * sigma
             if sigma
             else np.ptp(session.values[rows]) < MIN_SPANNED_STEPS * step
@@ -145,18 +146,28 @@ def _coarser_step(values: Array, step: float) -> float:
 
 
 def find_finer(session: Session) -> Iterator[Finding]:
-    """Findings about gauges with at least half of their readings between the steps."""
+    """Findings about gauges with readings between the steps.
+
+    They are notes about fewer than half of the readings, unless these are all of a setup.
+    """
     for name, gauge in session.gauges_with_readings.items():
         rows = _rows_of(session, name)
         if finer := _finer_rows(session, rows, gauge):
             step = gauge.resolution or 0.0
             inches = _are_inches(session.values[rows], step)
             evidence = _evidence(session, finer)
+            by_setup = group_rows(session.readings[i].setup for i in rows)
+            complete = [
+                setup
+                for setup, places in by_setup.items()
+                if len(places) > 1 and {rows[k] for k in places} <= set(finer)
+            ]
             yield words.finer_than_gauge(
                 len(finer),
                 len(rows),
                 step,
                 *evidence,
+                setups=complete,
                 inches=inches,
                 keys=_keys_of(session, name),
             )
@@ -194,9 +205,8 @@ def _rows_of(session: Session, gauge_name: str) -> list[int]:
 
 
 def _finer_rows(session: Session, rows: list[int], gauge: Gauge) -> list[int]:
-    """Rows with readings between the steps of a gauge; none if fewer than half of its rows."""
-    finer = np.flatnonzero(are_finer(session.values[rows], gauge)).tolist()
-    return [rows[i] for i in finer] if finer and len(finer) * 2 >= len(rows) else []
+    """Rows with readings between the steps of a gauge."""
+    return [rows[i] for i in np.flatnonzero(are_finer(session.values[rows], gauge)).tolist()]
 
 
 def _evidence(session: Session, rows: Sequence[int]) -> tuple[str, float, list[Place]]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import (
+    compensation_to_enter,
     entered_offsets,
     expanded_uncertainty,
     find_backlash,
@@ -252,11 +253,10 @@ def validate_calibration(
     wrongly = joint is None and _is_wrongly_entered(all_sessions, mistake)
     entries, notes = _choose_entries(calibration, joint, new, wrongly=wrongly)
     repetition = measure_repetition(calibration, refit)
-    stated = all(one.controller_offsets is not None for one in new)
-    notes += _describe_comparison(repetition, test, judgement, stated=stated)
+    notes += _describe_comparison(repetition, test, judgement) + _assumed(calibration, new)
     return Validation(
         confirmed=confirmed,
-        offsets_stated=stated,
+        offsets_stated=_state_offsets(new),
         expected_rms=expected.rms,
         expected_largest=expected.largest,
         excess_probability=test.p_value,
@@ -277,17 +277,24 @@ def validate_calibration(
 
 
 def _describe_comparison(
-    repetition: Repetition, test: DeviationTest, judgement: Judgement, *, stated: bool
+    repetition: Repetition, test: DeviationTest, judgement: Judgement
 ) -> list[Finding]:
-    """Findings about repeated residuals, and about active offsets that no session states.
-
-    That residuals of wrong readings repeat means nothing.
-    """
+    """Finding about repeated residuals. That those of wrong readings repeat means nothing."""
     exceeded = _is_expected(test.p_value) is False
     repeated = words.describe_repetition(repetition, exceeded=exceeded)
     means_nothing = repeated.kind == "residuals repeat" and judgement.verdict != "enter"
-    findings = [] if means_nothing else [repeated]
-    return findings if stated else [*findings, words.controller_assumed()]
+    return [] if means_nothing else [repeated]
+
+
+def _assumed(calibration: Calibration, new: Sequence[Session]) -> list[Finding]:
+    """Finding about calibrated values that are assumed, unless the sessions state theirs."""
+    backlash = bool(compensation_to_enter(calibration))
+    return [] if _state_offsets(new) else [words.controller_assumed(backlash=backlash)]
+
+
+def _state_offsets(sessions: Sequence[Session]) -> bool:
+    """True if all sessions state the active offsets."""
+    return all(one.controller_offsets is not None for one in sessions)
 
 
 def _apply_stated(
@@ -406,7 +413,7 @@ def _adjust_to_sessions(calibration: Calibration, sessions: Sequence[Session]) -
 
 
 def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
-    """Session with active offsets: as stated, otherwise as calibrated.
+    """Session with active offsets: as stated; otherwise with all values as calibrated.
 
     Raises:
         SessionError: If it states other offsets than the calibrated ones.
@@ -415,7 +422,9 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     entries = {drives.index(e.drive): e for e in find_entries(calibration)}
     if session.controller_offsets is None:
         stated = entries or calibration.session.controller_offsets is not None
-        return session.with_controller(entered_offsets(calibration)) if stated else session
+        assumed = session.compensation or compensation_to_enter(calibration)
+        entered = replace(session, compensation=assumed)
+        return entered.with_controller(entered_offsets(calibration)) if stated else entered
     differences, where = [], ""
     for i, entry in entries.items():
         active = float(session.active_offsets[i])

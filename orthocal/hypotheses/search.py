@@ -132,7 +132,7 @@ class _Search:
                 if state.log_posterior < sound.log_posterior + needed:
                     self.scorer = FamilyScorer(self.model, sound.about)
                     state, near = self._search()
-        return self._result(state, near)
+        return self._result(*self._confirm(state), near)
 
     def _search(self) -> tuple[HypothesisSet, list[tuple[HypothesisSet, HypothesisSet]]]:
         """Select hypotheses about the present sound set; returns as `_select` does.
@@ -289,15 +289,36 @@ class _Search:
     def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
         """Remove hypotheses that the others make superfluous."""
         while len(state.terms) > 1:
-            sets = [[t for t in state.terms if t is not removed] for removed in state.terms]
             needed = [min(SIMILAR_LOG_BAYES, _needed(removed)) for removed in state.terms]
-            evaluated = self.sets.evaluate_all(sets, self.sound.about)
+            evaluated = self.sets.evaluate_all(_reduced(state), self.sound.about)
             reduced = zip(needed, evaluated, strict=True)
             needed_gain, best = max(reduced, key=lambda pair: pair[1].log_posterior)
             if best.log_posterior < state.log_posterior - needed_gain:
                 break
             state = best
         return state
+
+    def _confirm(self, state: HypothesisSet) -> tuple[HypothesisSet, list[HypothesisSet]]:
+        """Remove hypotheses that a plausible machine makes superfluous.
+
+        Returns:
+            The set, and the sets without each of its hypotheses, about the most likely machine of
+            their readings if that is more likely.
+        """
+        while True:
+            without = [self.sound for _ in state.terms]
+            if len(state.terms) > 1:
+                near = self.sets.evaluate_all(_reduced(state), self.sound.about)
+                own = [self.sets.most_likely(s.terms) or s for s in near]
+                without = [min(p, key=negative_log_posterior) for p in zip(near, own, strict=True)]
+            superfluous = [
+                s
+                for t, s in zip(state.terms, without, strict=True)
+                if self.is_plausible(s) and state.log_posterior < s.log_posterior + _needed(t)
+            ]
+            if not superfluous:
+                return state, without
+            state = min(superfluous, key=negative_log_posterior)
 
     def _expected(self, state: HypothesisSet, row: int) -> float:
         """Prediction of a row from all other corrected rows, as in a recording, [m]."""
@@ -314,14 +335,21 @@ class _Search:
         return tuple(sorted(rows))
 
     def _result(
-        self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]
+        self,
+        state: HypothesisSet,
+        without: list[HypothesisSet],
+        near: list[tuple[HypothesisSet, HypothesisSet]],
     ) -> Anomalies:
-        """Anomalies of a state, with nearly as likely causes and alternatives."""
+        """Anomalies of a state, with nearly as likely causes and alternatives.
+
+        Args:
+            state: The state.
+            without: Sets without each of its hypotheses.
+            near: Pairs of a chosen set of hypotheses and a nearly as likely set.
+        """
         sound = self.sound
         anomalies = []
-        for term, e in zip(state.terms, explain_with_amounts(state), strict=True):
-            others = [t for t in state.terms if t is not term]
-            without = self.sets.evaluate(others, sound.about) if others else sound
+        for term, e, reduced in zip(state.terms, explain_with_amounts(state), without, strict=True):
             causes, alternatives = find_alternatives(term, near)
             row = e.rows[0] if len(e.rows) == 1 else None
             if causes and e.rows:
@@ -331,7 +359,7 @@ class _Search:
             anomalies.append(
                 Anomaly(
                     e,
-                    state.log_posterior - without.log_posterior,
+                    state.log_posterior - reduced.log_posterior,
                     None if row is None else self._expected(state, row),
                     causes,
                     alternatives,
@@ -349,6 +377,11 @@ class _Search:
             () if explained or not state.terms else self.suspected_rows(state),
             state.log_posterior,
         )
+
+
+def _reduced(state: HypothesisSet) -> list[list[Term]]:
+    """Hypotheses of a set without each of them."""
+    return [[t for t in state.terms if t is not removed] for removed in state.terms]
 
 
 def _is_clear(extended: HypothesisSet, state: HypothesisSet) -> bool:

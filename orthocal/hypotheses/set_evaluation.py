@@ -58,12 +58,13 @@ class SetEvaluator:
         self.reference = model.at_reference(keep_jacobian=model.has_shifts)
         self.sound = self.evaluate((), self.reference)
 
-    def most_likely(self) -> HypothesisSet | None:
-        """The set without hypotheses about the most likely machine; None if it is not possible."""
-        nearest = self.model.most_likely(self.values)
+    def most_likely(self, terms: Sequence[Term] = ()) -> HypothesisSet | None:
+        """The set of some hypotheses about its most likely machine; None if it is not possible."""
+        rows = self.evaluate(terms, self.sound.about).corrected if terms else self.values
+        nearest = self.model.most_likely(rows)
         point = LinearisationPoint(nearest.theta, (), nearest.passive)
         (about,) = self.model.linearise_all([point], keep_jacobian=self.model.has_shifts)
-        return None if about is None else self.evaluate((), about)
+        return None if about is None else self.evaluate(terms, about)
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
         """Score a set of hypotheses, relinearised as in `evaluate_all`."""

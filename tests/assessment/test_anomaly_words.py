@@ -9,7 +9,7 @@ import pytest
 
 from orthocal import load_session
 from orthocal.assessment.words.anomalies import _text, describe_anomalies
-from orthocal.assessment.words.remedies import advise, advise_about_sessions
+from orthocal.assessment.words.remedies import advise, advise_about_sessions, advise_repetition
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
 from orthocal.units import MM
 
@@ -121,6 +121,16 @@ def test_a_setup_whose_gauge_may_have_moved_is_read_again(root):
     sign = Explanation("reversed sign", "reading", rows=last[:1], factor=-1.0)
     finding = describe_alternatives(session, displaced, sign)
     assert f"type `restart {session.readings[last[0]].line}`" in finding.action
+
+
+def test_the_same_line_of_another_file_is_named(root):
+    session = load_session(root / "examples/raw-cycles/session.yaml")
+    first, second = (
+        replace(session.readings[0], line=7, file=root / name / "readings.csv") for name in "ab"
+    )
+    joined = replace(session, readings=(first, second))
+    both = Explanation("outlier", "reading", (0, 1))
+    assert "type `repeat 7`, likewise the other lines." in advise_repetition(joined, both)
 
 
 def test_changes_between_sessions_that_readings_do_not_distinguish_are_listed(root):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from effect_plans import FIRST, effect_plan
 
-from orthocal import check_session, simulate_session
+from orthocal import SessionError, calibrate, check_session, simulate_session
 from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.effect_separability import MAX_R_SQUARED, WARMER, find_unshown_effects
 from orthocal.estimation.problem import CalibrationProblem
@@ -78,6 +78,28 @@ def test_readings_without_approach_are_counted_with_their_lines(plan):
     assert found.numbers == {"missing": 4.0}
     assert f"4 of {len(rows)} readings (lines 5 to 7, 11) do not state" in found.text
     assert "`approach`" in found.action
+
+
+@pytest.mark.parametrize(
+    ("effect", "missing", "change"),
+    [
+        ("backlash", 60.0, lambda i, c: replace(c, approach=f"u{c.approach[1:]}")),
+        (
+            "backlash",
+            59.0,
+            lambda i, c: replace(c, approach=f"{'u' if i else 'p'}{c.approach[1:]}"),
+        ),
+        ("thermal", 57.0, lambda i, c: replace(c, temperature=20.0 if i < 3 else None)),
+        ("thermal", 60.0, lambda i, c: replace(c, temperature=None)),
+    ],
+)
+def test_only_conditions_of_all_readings_are_called_equal(plan, effect, missing, change):
+    """`calibrate` refuses the others."""
+    session = under(plan, change)
+    (found,) = (f for f in find(session, [effect]) if f.kind == "effect not shown")
+    assert found.numbers == {"missing": missing}
+    with pytest.raises(SessionError, match=f"which {missing:.0f} of 60 readings do not state"):
+        calibrate(session.with_effects([effect]))
 
 
 @pytest.mark.parametrize(("sigma", "helps"), [(20e-6, False), (1e-6, True)])

@@ -107,6 +107,8 @@ def test_sessions_before_and_after_entering_end_with_a_correction(entered):
     before, after = restore_session(first), restore_session(kept)
     joint = calibrate([before, after], **UNJUDGED)
     assert joint.measured_again
+    assert "new readings can check" in first.assessment.of_kind("no redundancy")[0].text
+    assert "new readings can check" not in joint.assessment.of_kind("no redundancy")[0].text
     active = tuple(joint.active_offsets.tolist())
     setups = tuple(replace(s, active=active) for s in joint.setups)
     assert not replace(joint, setups=setups).measured_again
@@ -116,6 +118,8 @@ def test_sessions_before_and_after_entering_end_with_a_correction(entered):
     assert "orthocal export out --to linuxcnc --out out-linuxcnc" in answer
     assert ("orthocal correct out PROGRAM.ngc --offsets active" in answer) is not keep
     assert "orthocal again" not in answer
+    assert "measure again" not in answer
+    assert ("Choose one" in joint.assessment.decision.action) is not keep
 
 
 def test_there_is_a_next_step_where_nothing_is_entered():

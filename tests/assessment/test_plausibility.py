@@ -11,22 +11,25 @@ import numpy as np
 import plans
 import pytest
 from calibrated import calibrated, plan_of, session_of
+from effect_plans import effect_plan
 from gauges import with_gauges
 from machines import write_orthoglide
 from models import TRUTH
 
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
-from orthocal.assessment.judgement import judge_session
+from orthocal.assessment.judgement import _owner_of, find_warnings, judge_session
 from orthocal.assessment.plausibility import (
     _check_distances,
     _legs,
     describe_legs,
+    find_finer,
     find_implausible,
     find_impossible_gauges,
 )
-from orthocal.assessment.words.effects import approach_incomplete
+from orthocal.assessment.words.effects import condition_incomplete
 from orthocal.assessment.words.plausibility import outstanding_error
 from orthocal.calibration.file import calibration_json
+from orthocal.effects.loading import measurable_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.output.text.answer import describe_machine
@@ -65,6 +68,20 @@ def test_readings_in_inches_are_found(session):
     assert [f.kind for f in found] == ["wrong unit"]
 
 
+def test_few_readings_between_the_steps_are_a_note_unless_all_of_a_setup():
+    """A setup in inches, whose small readings agree with the machine all the same."""
+    session = session_of("workshop")
+    of_setup = np.array([r.setup == next(iter(session.setups)) for r in session.readings])
+    rows = np.flatnonzero(of_setup)[1:]
+    few, inches = session.values, session.values
+    few[rows] += 3e-6
+    inches[of_setup] = np.round(inches[of_setup] / 25.4, 7)
+    for values, severity, count in ((few, "note", 2.0), (inches, "review", 3.0)):
+        (finer,) = find_finer(session.with_values(values))
+        assert (finer.severity, finer.numbers["readings_between_steps"]) == (severity, count)
+    assert not [f for f in find_warnings(session.with_values(few)) if f.severity == "note"]
+
+
 def test_small_readings_in_metres_are_found():
     """None of them is a hundredth of a step of the gauge."""
     errors = {name: 0.1 * error for name, error in TRUTH.items()}
@@ -80,7 +97,8 @@ def test_small_readings_in_metres_are_found():
 def test_some_means_of_cycles_may_be_finer_than_the_dial(session):
     values = session.values.copy()
     values[::4] += 3e-6
-    assert kinds(session.with_values(values)) == []
+    found = find_implausible(session.with_values(values))
+    assert [(f.kind, f.severity) for f in found] == [("finer than the gauge", "note")]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -331,20 +349,35 @@ def test_postures_of_another_session_are_not_too_near(cycles):
     ("name", "advice"),
     [
         ("setup.yx.roll", "Read setup yx again: a wrong reading, such as a dial misread by one"),
+        ("setup.2025.03.14/yx.roll", "Read setup 2025.03.14/yx again:"),
         ("x_slide.offset", "Measure that place or part again."),
     ],
 )
 def test_an_error_of_a_mounting_may_be_a_wrong_reading(name, advice):
     problem = build_problem(session_of("workshop"), model="offsets")
-    (parameter,) = (p for p in problem.parameters if p.name == name)
-    found = outstanding_error(parameter, 0.1)
+    plain = name.replace("2025.03.14/", "")
+    (parameter,) = (p for p in problem.parameters if p.name == plain)
+    found = outstanding_error(replace(parameter, name=name), 0.1)
     assert found.kind == "outstanding error"
     assert found.severity == "reject"
     assert found.action.startswith(advice)
 
 
+@pytest.mark.parametrize(
+    ("name", "label", "owner"),
+    [
+        ("setup.yx.roll", "", "setup.yx"),
+        ("setup.2025.03.14/y.x.roll", "2025.03.14", "setup.y.x"),
+        ("2025.03.14/square.block.long.bow", "2025.03.14", "square.block"),
+    ],
+)
+def test_names_with_dots_keep_the_owners_of_errors_apart(name, label, owner):
+    assert _owner_of(name, label) == owner
+
+
 @pytest.mark.parametrize(("two", "advice"), [(False, "Complete the column"), (True, "Differences")])
 def test_differences_of_two_postures_cannot_state_an_approach(two, advice):
-    found = approach_incomplete([3, 4], 2, 9, two_postures=two)
+    (effect,) = measurable_effects(effect_plan("backlash").robot)
+    found = condition_incomplete(effect, "approach", [3, 4], 2, 9, two_postures=two)
     assert found.text.startswith("2 of 9 readings (lines 3, 4) do not state")
     assert found.action.startswith(advice)

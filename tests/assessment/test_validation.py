@@ -527,6 +527,29 @@ def test_values_to_enter_after_a_backlash_that_was_not_entered():
     assert [f"{d.name} backlash" in text for d in plan.robot.drives] == [True] * 3
 
 
+def test_backlash_of_the_calibration_is_assumed_with_its_offsets():
+    """The controller has both. A session that states the offsets alone may lack the backlash."""
+    plan = effect_plan("backlash", setups=FEW).with_controller(np.zeros(3))
+    errors = {f"{d.name}.backlash": 40e-6 for d in plan.robot.drives} | {"x_slide.offset": 0.2e-3}
+    calibration = calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
+    entered = plan.with_controller(entered_offsets(calibration))
+    entered = replace(entered, compensation=compensation_to_enter(calibration))
+    stated = replace(simulate_session(entered, errors, seed=2).session, compensation=())
+    silent = replace(stated.with_controller(np.zeros(3)), controller_offsets=None)
+    result = validate_calibration(calibration, silent)
+    assert result.confirmed
+    (assumed,) = result.assessment.of_kind("controller assumed")
+    assert "offsets and the backlash" in assumed.text
+    result = validate_calibration(calibration, stated)
+    assert result.confirmed is False
+    changed = result.assessment.of_kind("machine changed")
+    assert {p.parameter for f in changed for p in f.places} <= {
+        f"{d.name}.backlash" for d in plan.robot.drives
+    }
+    assert all("compensates another backlash" in f.text for f in changed)
+    assert "`controller.backlash_mm`" in changed[0].action
+
+
 def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(plan):
     """New readings with three times the noise: nothing odd in all of them, but not as predicted."""
     errors, first, calibration = calibrated_machine("raw-cycles", "full", 3)

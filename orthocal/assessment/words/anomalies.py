@@ -25,6 +25,7 @@ from orthocal.assessment.words.remedies import (
     advise_repetition,
     can_turn,
     has_known_zero,
+    is_backlash,
 )
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import robot_effects, with_effects
@@ -561,10 +562,12 @@ def _changed(session: Session, e: Explanation) -> str:
             f"drive {joined(e.drives)} or its home switch moved{amount} {when}, or "
             f"{_other_offset(session, e)}"
         )
-    what, verb = joined(e.parameters), "changed"
+    what, verb, otherwise = joined(e.parameters), "changed", ""
     if e.drives:
         what, verb = name_offsets(e.drives, firmware=True), "moved"
-    return f"the machine changed: {what} {verb}{amount} {when}"
+    elif is_backlash(e):
+        otherwise = ", or the controller compensates another backlash than the stated one"
+    return f"the machine changed: {what} {verb}{amount} {when}{otherwise}"
 
 
 def _lost_steps(session: Session, e: Explanation) -> str:

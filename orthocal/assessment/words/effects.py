@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from orthocal.assessment.wording import joined, note, parameter_places
 from orthocal.calibration.assessment_record import Finding, Place
-from orthocal.effects.protocol import Effect
+from orthocal.effects.protocol import Condition, Effect
+from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
 from orthocal.text import spans
 
 EFFECT_NOUNS = {
-    "backlash": "backlash",
+    "backlash": "the backlash of the drives",
     "thermal": "thermal expansion",
     "screw": "the periodic error of the screws",
     "drift": "the drift of the gauge",
@@ -33,28 +34,40 @@ def approach_not_stated() -> Finding:
     )
 
 
-def approach_incomplete(
-    lines: Sequence[int], count: int, total: int, *, two_postures: bool
+def condition_incomplete(
+    effect: Effect,
+    condition: Condition,
+    lines: Sequence[int],
+    count: int,
+    total: int,
+    *,
+    two_postures: bool,
 ) -> Finding:
-    """Finding about some readings without stated side of approach.
+    """Finding about readings without a condition that an effect needs.
 
     Args:
-        lines: Their lines, ascending; empty if unknown.
+        effect: The effect.
+        condition: The condition.
+        lines: Their lines, ascending; empty if unknown or in several files.
         count: Number of these readings.
         total: Number of all readings.
-        two_postures: Whether one of them belongs to two postures, so that it cannot state a side.
+        two_postures: Whether one of them belongs to two postures, so that it states no condition.
     """
     where = f" ({spans(lines, 'line')})" if lines else ""
-    action = "Complete the column `approach`."
+    stated = f"their {condition}"
+    if condition == "approach":
+        stated = "from which side their posture was approached"
+    noun = EFFECT_NOUNS.get(effect.name, effect.describe())
+    action = f"Complete the column `{COLUMNS_OF_CONDITIONS[condition]}`."
     if two_postures:
         action = (
             "Differences and distances of two postures cannot state it: calibrate without them, or "
-            "without backlash (`--effects none`)."
+            f"without {noun} (`--effects none`)."
         )
     return note(
         "effect not shown",
-        f"{count} of {total} readings{where} do not state from which side their posture was "
-        "approached. `calibrate` needs it for the backlash of the drives.",
+        f"{count} of {total} readings{where} do not state {stated}. `calibrate` needs it for "
+        f"{noun}.",
         action,
         missing=float(count),
     )

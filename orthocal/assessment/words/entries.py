@@ -37,6 +37,15 @@ FIRMWARE_KEEP_HEADLINE = "Leave the settings as they are."
 FIRMWARE_STEP = "`orthocal export` writes the settings."
 """Next step after the calibration of a printer."""
 
+CHOICE_HEADLINE = "Enter these offsets, or correct all identified errors."
+"""Headline of a calibration that measured again: both are possible now."""
+
+CHOICE_STEP = (
+    "Choose one: enter these offsets; or leave the present ones, and correct all identified errors "
+    "in LinuxCNC or in programs."
+)
+"""Next step of such a calibration."""
+
 KEEP_HEADLINE = "Leave the offsets as they are."
 """Headline of a calibration that changes no offset."""
 

@@ -142,7 +142,7 @@ def gauge_overstated(sigma: float, stated: float, of_gauge: str) -> Finding:
     )
 
 
-def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
+def no_redundancy(readings: int, parameters: int, *, mounting: bool, again: bool) -> Finding:
     """Finding that the fit has no redundant readings.
 
     Args:
@@ -150,13 +150,15 @@ def no_redundancy(readings: int, parameters: int, *, mounting: bool) -> Finding:
         parameters: Number of free errors of the machine.
         mounting: True if readings beyond those that determine the errors serve the mounting of
             gauges.
+        again: True if readings after a change of the offsets are among them.
     """
     further = " and the mounting of the gauges" if mounting else ""
+    check = "" if again else " Only new readings can check it."
     return note(
         "no redundancy",
         f"There {'is' if readings == 1 else 'are'} {counted(readings, 'independent reading')} for "
-        f"{parameters} possible errors{further}, so the result relies on the stated tolerances. "
-        "Only new readings can check it.",
+        f"{parameters} possible errors{further}, so the result relies on the stated "
+        f"tolerances.{check}",
         independent_readings=float(readings),
         parameters=float(parameters),
     )

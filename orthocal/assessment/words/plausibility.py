@@ -78,11 +78,12 @@ def outstanding_error(parameter: Parameter, error: float) -> Finding:
     action = (
         "Measure that place or part again. If it is so far off, state its true value or a larger "
     )
-    kind, *names = parameter.name.split(".")
-    if kind == "setup" and names:
+    kind, _, name = parameter.name.partition(".")
+    if kind == "setup":
         action = (
-            f"Read setup {names[0]} again: a wrong reading, such as a dial misread by one turn, "
-            "may look the same. If the readings were right, state the true value or a larger "
+            f"Read setup {name.rpartition('.')[0]} again: a wrong reading, such as a dial misread "
+            "by one turn, may look the same. If the readings were right, state the true value or a "
+            "larger "
         )
     return reject(
         "outstanding error",
@@ -137,10 +138,13 @@ def finer_than_gauge(
     value: float,
     places: Sequence[Place],
     *,
+    setups: Sequence[str],
     inches: bool,
     keys: GaugeKeys,
 ) -> Finding:
     """Finding about readings between the steps of the gauge.
+
+    It is a note about fewer than half of the readings, unless these are all of a setup.
 
     Args:
         count: Number of readings between the steps.
@@ -149,13 +153,20 @@ def finer_than_gauge(
         where: File and line of the first of them.
         value: Its value, [m].
         places: Places of them.
+        setups: Setups with only such readings.
         inches: Whether all readings of the gauge are multiples of the step if they are in inches.
         keys: The gauge.
     """
     first = f"The first is {value / MM:.6g} mm in {where}."
-    text, action = (
+    beginning = (
         f"The gauge{_named(keys.name)} shows steps of {step / MM:g} mm ({keys.resolution}), but "
-        f"{count} of its {total} readings have more digits, or are in inches. {first}",
+        f"{count} of its {total} readings"
+    )
+    few = 2 * count < total
+    if few and setups:
+        beginning += f" (all of {named('setup', setups)})"
+    text, action = (
+        f"{beginning} have more digits, or are in inches. {first}",
         "Make sure that the readings are in mm, not in inches, and that the resolution is right"
         f"{', and that each setup names its gauge' if keys.name else ''}.",
     )
@@ -166,7 +177,12 @@ def finer_than_gauge(
             f"{step / MM:g} mm. {first}",
             "If so, multiply these readings by 25.4, or use `orthocal import --unit inch`.",
         )
-    return review(
+    describe = review
+    if few and not setups:
+        describe = note
+        text = f"{beginning} have more digits. {first}"
+        action = "If they are neither means nor read between two marks, correct them."
+    return describe(
         "finer than the gauge",
         text,
         action,

@@ -91,10 +91,10 @@ def advise_repetition(session: Session, *explanations: Explanation) -> str:
         return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, quote_path(file.parent)
     others = ""
-    if further := {r.line or 0 for r in rows} - {line}:
-        one_file = len({r.file for r in rows}) == 1
-        named = spans(sorted(further), "line") if one_file else "the other lines"
-        others = f", likewise {named}"
+    if further := {(r.file, r.line or 0) for r in rows} - {(rows[0].file, line)}:
+        one_file = {f for f, _ in further} == {rows[0].file}
+        shown = spans(sorted(k for _, k in further), "line") if one_file else "the other lines"
+        others = f", likewise {shown}"
     correct = f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
     if not all(_has_present_offsets(session, r) for r in rows):
         return (
@@ -155,9 +155,9 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
             f"changed, look for the cause at {joined(e.drives)}, and measure the session again."
         )
     if e.kind == "offset of one drive" or (
-        e.kind == "machine changed" and e.drives and not e.apart
+        e.kind == "machine changed" and not e.apart and (e.drives or is_backlash(e))
     ):
-        return _advise_other_offset(session, e)
+        return _advise_other_number(session, e)
     if e.kind != "machine changed":
         number, keys = "offsets", OFFSET_KEYS
         if e.kind.startswith("backlash"):
@@ -199,15 +199,23 @@ def _name_keys(session: Session, keys: Mapping[str, tuple[Unit, float]], e: Expl
     return joined(names, "or")
 
 
-def _advise_other_offset(session: Session, e: Explanation) -> str:
-    """Action after a drive that moved, or has another offset than the stated one."""
-    key = _name_keys(session, OFFSET_KEYS, e)
+def _advise_other_number(session: Session, e: Explanation) -> str:
+    """Action after a drive that changed, or has another number in the controller than stated."""
+    number, keys, changed = "offsets", OFFSET_KEYS, "the drive or its home switch has moved"
+    if is_backlash(e):
+        number, keys, changed = "backlash", BACKLASH_KEYS, "the drive has changed"
+    note = f"{OFFSETS_IN_LINUXCNC} " if number == "offsets" else ""
     return (
-        f"Compare the offsets in the controller with {key} of session {e.sessions[0]}. "
-        f"{OFFSETS_IN_LINUXCNC} If they differ, state there those that were in the controller, and "
-        "calibrate again. If they agree, the drive or its home switch has moved: "
-        f"{_calibrate_present(session, e)}, and enter its offsets."
+        f"Compare the {number} in the controller with {_name_keys(session, keys, e)} of session "
+        f"{e.sessions[0]}. {note}If they differ, state there those that were in the controller, "
+        f"and calibrate again. If they agree, {changed}: {_calibrate_present(session, e)}, and "
+        f"enter its {number}."
     )
+
+
+def is_backlash(e: Explanation) -> bool:
+    """True if the backlash of a drive changed between sessions."""
+    return e.kind == "machine changed" and e.parameters[0].endswith(".backlash")
 
 
 def _calibrate_present(session: Session, e: Explanation) -> str:

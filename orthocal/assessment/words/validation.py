@@ -205,11 +205,16 @@ def describe_repetition(
     return note("residuals differ", text, **numbers)
 
 
-def controller_assumed() -> Finding:
-    """Finding that the active offsets are not stated, so that the calibrated ones are assumed."""
+def controller_assumed(*, backlash: bool) -> Finding:
+    """Finding that the active offsets are not stated, so that the calibrated ones are assumed.
+
+    Args:
+        backlash: Whether the calibrated backlash is assumed, too.
+    """
+    assumed = "offsets and the backlash" if backlash else "offsets"
     return note(
         "controller assumed",
-        "The session does not state the active offsets. The offsets of the calibration are assumed "
-        "to be active.",
+        f"The session does not state the active offsets. The {assumed} of the calibration are "
+        "assumed to be active.",
         "State the active ones in its session.yaml (`controller`).",
     )

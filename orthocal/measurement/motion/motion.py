@@ -612,11 +612,12 @@ def _predict(
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
-    low, high = range_of_expected(session, setup, stops[first])
+    gauge, differences = sampled.gauges[sampled.setups[setup].gauge], stops[first].role != "reading"
+    low, high = range_of_expected(gauge, differences=differences)
     if session.setups[setup].zero != "known":
         predicted = predicted - predicted[ends[first] - 1]
-        if stops[first].role == "reading":
-            predicted += session.gauges[session.setups[setup].gauge].middle
+        if not differences:
+            predicted += gauge.middle
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""

@@ -11,12 +11,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import expanded_uncertainty, lowers, readings_limit
+from orthocal.assessment.assess import assessment_of, gains_from_correction
+from orthocal.assessment.controller_entries import expanded_uncertainty, readings_limit
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import (
+    CHOICE_STEP,
     describe_compensated,
     describe_region,
     describe_use_parts,
@@ -45,7 +46,7 @@ from orthocal.output.text.layout import (
     table_of_records,
 )
 from orthocal.session.session import split_label
-from orthocal.text import quote_path
+from orthocal.text import quote_path, uncapitalised
 from orthocal.units import DRIVE_UNITS, show_limit, tidy
 
 NEXT_NAMES = dict(pairwise(("first", "second", "third", "fourth", "fifth", "sixth")))
@@ -242,13 +243,11 @@ def _next_step(
         )
     paths = (saved, next_session(calibration, saved), f"{saved}-linuxcnc")
     directory, new, module = (quote_path(path) for path in paths)
-    if gains_from_correction(calibration) and (unchanged or calibration.measured_again):
+    gains = gains_from_correction(calibration, assessment.tool)
+    if gains and (unchanged or calibration.measured_again):
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
-            words = (
-                "choose one: enter these offsets; or leave the present ones, and correct all "
-                "identified errors in LinuxCNC or in programs."
-            )
+            words = uncapitalised(CHOICE_STEP)
         active = "" if unchanged else " --offsets active"
         home = quote_path(f"{saved}-home")
         offsets = f"orthocal export {directory} --to linuxcnc --offsets --ini FILE --out {home}"
@@ -279,14 +278,6 @@ def next_session(calibration: Calibration, saved: Path) -> Path:
         return Path(f"{saved}-again")
     name = Path(os.path.abspath(last)).parent.name
     return saved.parent / NEXT_NAMES.get(name, f"{name}-again")
-
-
-def gains_from_correction(calibration: Calibration) -> bool:
-    """True if correcting all identified errors lowers the tool error beyond entered offsets."""
-    tool = assessment_of(calibration).tool
-    return (
-        not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
-    )
 
 
 def calibrate_command(

@@ -254,7 +254,8 @@ class RecordingText:
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
-        parts = [f"Place: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        place = "Place at the mechanical zero" if hasattr(sensor, "leg") else "Place"
+        parts = [f"{place}: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
         gauge, gauge_or_stand = _name_gauge(setup), _name_gauge(setup, stand=True)
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.assess import assessment_of, gains_from_correction
 from orthocal.assessment.validation import Validation
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import describe_tool_error
@@ -19,7 +19,6 @@ from orthocal.output.text.answer import (
     describe_columns,
     describe_conditions,
     entry_table,
-    gains_from_correction,
     render_backlash,
     render_headline,
     render_next,
@@ -124,7 +123,7 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
         return []
     if further:
         words = f"to use the better {'settings' if firmware else 'offsets'}:"
-    elif joint and gains_from_correction(validation.final_calibration):
+    elif joint and gains_from_correction(validation.final_calibration, validation.assessment.tool):
         words = "to correct the other identified errors, too, calibrate from all readings:"
     else:
         return []
