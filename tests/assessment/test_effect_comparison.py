@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from calibrated import SOUND, UNJUDGED, session_of
 from effect_plans import ALL, FEW, FIRST, effect_plan
+from gauges import with_gauges
 from slack import Slack
 
 from orthocal import calibrate, simulate_session
@@ -87,16 +88,8 @@ def test_an_effect_that_cannot_act_does_not_change_the_evidence(session):
         replace(r, conditions=replace(r.conditions, time=FIRST + timedelta(seconds=k)))
         for k, r in enumerate(rows)
     ]
-    first, *_ = session.setups
-    plan = replace(
-        session,
-        readings=tuple(timed),
-        gauges={"dial": Gauge(2e-6), "digital": Gauge(1e-6)},
-        setups={
-            n: replace(s, gauge="dial" if n == first else "digital")
-            for n, s in session.setups.items()
-        },
-    )
+    gauges, (_, *others) = {"coarse": Gauge(2e-6), "fine": Gauge(1e-6)}, session.setups
+    plan = with_gauges(replace(session, readings=tuple(timed)), gauges, others)
     noisy = simulate_session(plan, ERRORS, seed=4).session
     values = noisy.values
     values[[r.cycle == 2 for r in noisy.readings]] += 6e-6  # above the stated noise
@@ -170,10 +163,7 @@ def test_the_option_is_named_unless_the_effect_is_stated(compared, stated, optio
 
 def test_a_comparison_of_models_recommends_the_effect(session):
     found = compare_models(
-        session.with_effects(["backlash"]),
-        models=["offsets"],
-        options=QUICK,
-        judgement=SOUND,
+        session.with_effects(["backlash"]), models=["offsets"], options=QUICK, judgement=SOUND
     )
     (note,) = found.assessment.of_kind("effects recommended")
     assert note.action == ""
