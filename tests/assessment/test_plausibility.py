@@ -53,6 +53,11 @@ def kinds(session):
     return [d.kind for d in find_implausible(session)]
 
 
+def judged(session):
+    """Findings of the judgement that are no notes."""
+    return [f for f in judge_session(session).findings if f.severity != "note"]
+
+
 def test_readings_in_inches_are_found(session):
     inches = session.with_values(np.round(session.values / 25.4, 7))
     (finer,) = (f for f in find_implausible(inches) if f.kind == "finer than the gauge")
@@ -61,8 +66,7 @@ def test_readings_in_inches_are_found(session):
     (finer,) = (f for f in find_implausible(coarse) if f.kind == "finer than the gauge")
     assert "readings have more digits, or are in inches" in finer.text
     assert "residuals too small" in kinds(inches)
-    found = [f for f in judge_session(inches).findings if f.severity != "note"]
-    assert [f.kind for f in found] == ["wrong unit"]
+    assert [f.kind for f in judged(inches)] == ["wrong unit"]
 
 
 def test_small_readings_in_metres_are_found():
@@ -71,10 +75,9 @@ def test_small_readings_in_metres_are_found():
     session = simulate_session(plan_of("workshop"), errors, seed=1).session
     metres = session.with_values(np.round(session.values * 1e-3, 9))
     assert not list(find_impossible_gauges(metres))
-    found = [f for f in judge_session(metres).findings if f.severity != "note"]
-    assert [(f.kind, f.text) for f in found] == [
-        ("wrong unit", "It looks as if all readings were written in m.")
-    ]
+    (found,) = judged(metres)
+    text = "It looks as if all readings were written in m."
+    assert (found.kind, found.text) == ("wrong unit", text)
 
 
 def test_some_means_of_cycles_may_be_finer_than_the_dial(session):
@@ -134,10 +137,9 @@ def test_postures_of_a_machine_of_other_dimensions_are_found(tmp_path, plan, ses
 def test_a_line_with_the_name_of_another_setup_is_not_another_machine():
     """A leg swings by tens of millimetres where its indicator does not follow it."""
     session = session_of("workshop")
-    readings = [
-        replace(r, setup="xz") if (r.setup, r.posture) == ("zx", "x_max") else r
-        for r in session.readings
-    ]
+    readings = list(session.readings)
+    row = [(r.setup, r.posture) for r in readings].index(("zx", "x_max"))
+    readings[row] = replace(readings[row], setup="xz")
     found = judge_session(replace(session, readings=tuple(readings)))
     assert found.verdict == "review"
     finding = found.findings[0]
@@ -172,17 +174,15 @@ def test_equal_legs_without_errors_of_their_frames_do_not_differ(cycles):
     [
         ({"resolution": 10e-3, "range": (-0.4e-3, 0.4e-3)}, {"range_mm": 0.8}),
         ({"resolution": 10e-3, "range": None}, {"readings_between_steps": 49.0}),
-        (
-            {"resolution": 0.5e-3},
-            {"readings_between_steps": 51.0},
-        ),  # of ±5 mm, but 50 times the noise
+        # of ±5 mm, but 50 times the noise
+        ({"resolution": 0.5e-3}, {"readings_between_steps": 51.0}),
         ({"resolution": 0.5e-3, "sigma": None, "range": None}, {"readings_between_steps": 51.0}),
     ],
 )
 def test_an_impossible_resolution_is_the_only_finding(cycles, gauge, number):
     """Such steps would also explain decimal points and inches."""
     wrong = cycles.with_gauge(replace(cycles.gauge, **gauge))
-    (found,) = [f for f in judge_session(wrong).findings if f.severity != "note"]
+    (found,) = judged(wrong)
     assert found.kind == "resolution too coarse"
     expected = {"resolution_mm": gauge["resolution"] * 1e3} | number
     assert found.numbers == pytest.approx(expected)
@@ -192,15 +192,15 @@ def test_an_impossible_resolution_is_the_only_finding(cycles, gauge, number):
 def test_a_resolution_of_a_tenth_of_the_readings_is_the_only_finding(cycles):
     """Rounding to 0.01 mm would look like mistakes."""
     wrong = cycles.with_gauge(replace(cycles.gauge, resolution=1e-6, sigma=0.5e-6))
-    (found,) = [f for f in judge_session(wrong).findings if f.severity != "note"]
+    (found,) = judged(wrong)
     assert found.kind == "resolution too fine"
     assert found.numbers == pytest.approx({"resolution_mm": 0.001, "coarser_mm": 0.01})
     assert "more scatter than its stated noise" in found.text
     unstated = wrong.with_gauge(replace(wrong.gauge, sigma=None))
     (found,) = find_impossible_gauges(unstated)
     assert "stated noise" not in found.text
-    rows = np.arange(5)  # five such readings may be by chance
-    assert not list(find_impossible_gauges(wrong.select([wrong.readings[i] for i in rows])))
+    # five such readings may be by chance
+    assert not list(find_impossible_gauges(wrong.select(wrong.readings[:5])))
 
 
 @pytest.mark.parametrize("joined", [False, True])
