@@ -11,13 +11,7 @@ from calibrated import plan_of, session_of
 from made_mistakes import make_mistakes, sound_session
 from scipy.stats import chi2
 
-from orthocal import (
-    check_session,
-    join_sessions,
-    load_session,
-    simulate_session,
-    write_session,
-)
+from orthocal import check_session, join_sessions, load_session, simulate_session, write_session
 from orthocal.assessment import judgement
 from orthocal.hypotheses.families.sessions import changes_between_sessions, detectable_changes
 from orthocal.hypotheses.hypothesis_set import explain_with_amounts
@@ -38,6 +32,10 @@ def reverse(session, setup):
     """The session with other signs of a setup's readings."""
     values = [-r.value if r.setup == setup else r.value for r in session.readings]
     return session.with_values(values)
+
+
+def joined(days, *names):
+    return join_sessions([load_session(days / n) for n in names])
 
 
 def test_a_reversed_setup_is_named():
@@ -80,8 +78,7 @@ def days(plan, tmp_path_factory):
 
 
 def test_a_displaced_slide_is_named_with_its_amount_and_session(days):
-    names = ("monday", "tuesday", "wednesday")
-    found = check_session(join_sessions([load_session(days / n) for n in names]))
+    found = check_session(joined(days, "monday", "tuesday", "wednesday"))
     assert (found.decision.verdict, found.decision.exit_code) == ("review", 3)
     (finding,) = found.of_kind("machine changed")
     amount, std = (finding.numbers[f"x_slide.offset_{n}_mm"] for n in ("by", "std"))
@@ -97,7 +94,7 @@ def test_a_drive_that_moved_is_described_alike_after_two_sessions_and_more(days)
     """Only the second of two sessions states new offsets; the third one states the same."""
     texts, kinds = set(), []
     for names in (("monday", "wednesday"), ("monday", "tuesday", "wednesday")):
-        found = check_session(join_sessions([load_session(days / n) for n in names]))
+        found = check_session(joined(days, *names))
         (finding,) = [f for f in found.findings if f.severity == "review"]
         kinds.append(finding.kind)
         texts.add(re.sub(r"\d+\.\d+", "#", f"{finding.text} {finding.action}"))
@@ -107,7 +104,7 @@ def test_a_drive_that_moved_is_described_alike_after_two_sessions_and_more(days)
 
 
 def test_without_a_change_the_detectable_size_is_stated(days):
-    found = check_session(join_sessions([load_session(days / n) for n in ("monday", "tuesday")]))
+    found = check_session(joined(days, "monday", "tuesday"))
     assert found.decision.verdict == "enter"
     (finding,) = found.of_kind("no change")
     assert 0.03 < finding.numbers["seen_from_mm"] < 0.12
@@ -116,7 +113,7 @@ def test_without_a_change_the_detectable_size_is_stated(days):
 
 
 def test_changes_beyond_the_travel_are_not_said_to_be_detectable(days, monkeypatch):
-    sessions = join_sessions([load_session(days / n) for n in ("monday", "tuesday")])
+    sessions = joined(days, "monday", "tuesday")
     changes = {"x_slide": 200.0, "y_slide": 0.4e-3, "z_slide": 0.3e-3}
     monkeypatch.setattr(judgement, "detectable_changes", lambda _: changes)
     (finding,) = check_session(sessions).of_kind("no change")
@@ -165,10 +162,10 @@ def test_a_tilted_slide_is_not_named_as_displaced(plan):
 
 
 def test_a_wrong_reading_is_no_change(days):
-    joined = join_sessions([load_session(days / n) for n in ("monday", "tuesday")])
-    values = joined.values
+    session = joined(days, "monday", "tuesday")
+    values = session.values
     values[70] += 0.3e-3
-    (found,) = find_anomalies(joined.with_values(values)).found
+    (found,) = find_anomalies(session.with_values(values)).found
     assert found.explanation.rows == (70,)
 
 
