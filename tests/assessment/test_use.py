@@ -377,32 +377,32 @@ def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, cali
     points = np.array([[0.0, 0.0, 0.0], [10.0, -20.0, 5.0], [-15.0, 25.0, 10.0], [5.0, 5.0, -30.0]])
     lines = [f"N{n} G0 X{x} Y{y} Z{z}" for n, (x, y, z) in enumerate(points, start=1)]
     (folder / "part.ngc").write_text("\n".join(["G21", *lines, ""]))
-    words = ("correct", ".", "part.ngc", "--anyway", "--offsets", "active")
-    words += ("--backlash", "controller")
-    code, cold, note = run_orthocal(folder, *words)
-    assert code == 0
+    (folder / "point.ngc").write_text("G21\nN1 G0 X0 Y0 Z0\n")
+
+    def correct(file, *options):
+        """A corrected program, the comments at its top, and the notes."""
+        done = run_orthocal(folder, "correct", ".", file, "--anyway", *options)
+        assert done.returncode == 0
+        lines = done.stdout.splitlines()
+        return done.stdout, [c for c in lines if c.startswith(";")], done.stderr
+
+    active, controller = ("--offsets", "active"), ("--backlash", "controller")
+    cold, at_20, note = correct("part.ngc", *active, *controller)
     assert "20 °C (--temperature)" in note
-    code, warm, note = run_orthocal(folder, *words, "--temperature", "34", "--payload", "4")
-    assert code == 0
+    stated = ("--temperature", "34", "--payload", "4")
+    warm, at_34, note = correct("part.ngc", *active, *controller, *stated)
     assert "--temperature" not in note
-
-    def head(text):
-        """Comments at the top of a program."""
-        return [line for line in text.splitlines() if line.startswith(";")]
-
-    (at_20,), (at_34,) = ([c for c in head(text) if "°C" in c] for text in (cold, warm))
-    assert "20 °C and no payload" in at_20
-    assert "34 °C and payload 4 kg" in at_34
-    assert any("controller must compensate the backlash" in c for c in head(warm))
-    code, taken_up, _ = run_orthocal(folder, *words[:-2])
-    assert code == 0
-    assert any("The controller must not compensate" in c for c in head(taken_up))
+    assert ["20 °C and no payload" in c for c in at_20 if "°C" in c] == [True]
+    assert ["34 °C and payload 4 kg" in c for c in at_34 if "°C" in c] == [True]
+    assert any("controller must compensate the backlash" in c for c in at_34)
     # with the values to enter, the controller compensates the backlash, unless it cannot
-    entered = words[:4]
-    for option, part in (((), "must compensate"), (("--backlash", "program"), "must not")):
-        code, text, _ = run_orthocal(folder, *entered, *option)
-        assert code == 0
-        assert any(f"controller {part}" in c.lower() for c in head(text))
+    for options, part in (
+        (active, "must not"),
+        ((), "must compensate"),
+        (("--backlash", "program"), "must not"),
+    ):
+        _, comments, _ = correct("point.ngc", *options)
+        assert any(f"controller {part}" in c.lower() for c in comments)
 
     def commanded(text):
         """Ends of the motions of the program, shape (4, 3), [m]."""
