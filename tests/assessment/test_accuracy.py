@@ -297,12 +297,6 @@ def test_shares_of_the_uncertainty_add_up_to_it(sweep):
     assert all(a.rms >= b.rms for a, b in itertools.pairwise(parts[:20]))
 
 
-def test_the_uncertainty_is_unknown_without_a_noise(experiment_2):
-    rows = [experiment_2.readings[i] for i in (2, 0, 4)]
-    session = experiment_2.select(rows).with_gauge(replace(experiment_2.gauge, sigma=None))
-    assert assess_tool(identified(session)).after is None
-
-
 def test_machines_within_their_tolerances_have_no_other_scale():
     plan = plan_of("raw-cycles")
     plan = plan.with_gauge(replace(plan.gauge, range=None))
