@@ -16,11 +16,7 @@ from scipy.integrate import quad
 from slack import Slack
 from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
-from orthocal import (
-    Choice,
-    check_session,
-    simulate_session,
-)
+from orthocal import Choice, check_session, simulate_session
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.errors import RobotError
@@ -110,11 +106,9 @@ def test_thermal_expansion_is_named_without_deviation_from_its_stated_size():
 
 
 def test_effects_of_a_thousandth_of_their_tolerance_are_not_named(plan):
-    effect = "backlash"
-    machine = plan.with_effects([effect])
-    names = [n for n in machine.robot.parameters.of_effects]
-    errors = {n: 1e-3 * machine.robot.parameters[n].prior_std for n in names}
-    assert find_anomalies(read(plan, effect, errors)).found == ()
+    parameters = plan.with_effects(["backlash"]).robot.parameters
+    errors = {n: 1e-3 * parameters[n].prior_std for n in parameters.of_effects}
+    assert find_anomalies(read(plan, "backlash", errors)).found == ()
 
 
 def test_an_approach_from_one_side_shows_no_backlash(plan):
@@ -183,7 +177,7 @@ def test_an_effect_that_does_not_fit_the_robot_is_not_tested(slack):
 
 def test_a_reversed_sign_is_not_named_as_an_effect(plan):
     session = read(plan, None, {})
-    values = session.values.copy()
+    values = session.values
     row = int(np.abs(values).argmax())
     values[row] *= -1.0
     (found,) = find_anomalies(session.with_values(values)).found
