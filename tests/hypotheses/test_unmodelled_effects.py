@@ -16,7 +16,8 @@ from scipy.integrate import quad
 from slack import Slack
 from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
-from orthocal import Choice, check_session, simulate_session
+from orthocal import Choice, simulate_session
+from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.errors import RobotError
@@ -53,7 +54,8 @@ def with_backlash(plan):
 
 
 def test_backlash_is_named_with_its_drive_amount_and_option(with_backlash):
-    (found,) = find_anomalies(with_backlash).found
+    judgement = judge_session(with_backlash)
+    (found,) = judgement.anomalies
     e = found.explanation
     assert (e.kind, found.ambiguous) == ("backlash", False)
     amounts = dict(zip(e.parameters, zip(e.amounts, e.stds, strict=True), strict=True))
@@ -61,8 +63,7 @@ def test_backlash_is_named_with_its_drive_amount_and_option(with_backlash):
     assert value == pytest.approx(50e-6, abs=3.0 * std)
     assert std < 10e-6
     assert amounts["x_slide.backlash"][0] < 10e-6
-    assessment = check_session(with_backlash)
-    (finding,) = [f for f in assessment.findings if f.severity != "note"]
+    (finding,) = [f for f in judgement.findings if f.severity != "note"]
     assert (finding.kind, finding.severity) == ("backlash", "review")
     assert [p.parameter for p in finding.places] == ["y_slide.backlash"]
     assert "--effects backlash" in finding.action
@@ -138,13 +139,14 @@ LOOSE = {
 
 def test_an_effect_of_another_package_is_named_by_its_description(slack):
     session = read(slack, "slack", LOOSE)
-    (found,) = find_anomalies(session).found
+    judgement = judge_session(session)
+    (found,) = judgement.anomalies
     e = found.explanation
     assert (e.kind, e.effect, found.ambiguous) == ("other effect", "slack", False)
     for name, amount, std in zip(e.parameters, e.amounts, e.stds, strict=True):
         assert amount == pytest.approx(LOOSE.get(name, 0.0), abs=3.0 * std)
     assert dict(zip(e.parameters, e.stds, strict=True))["x_slide.slack"] < 4e-6
-    (finding,) = [f for f in check_session(session).findings if f.severity != "note"]
+    (finding,) = [f for f in judgement.findings if f.severity != "note"]
     assert finding.kind == "other effect"
     assert Slack.describe(None) in finding.text
     assert {"x_slide.slack", "y_slide.slack"} <= {p.parameter for p in finding.places}
