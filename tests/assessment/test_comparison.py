@@ -70,10 +70,10 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     assert found.of_kind("repetition unknown")  # no reading is redundant
 
 
-def test_models_are_compared_with_the_recommended_one_only():
+def test_models_are_compared_with_the_recommended_one_only(table1):
     """Without the complete model, which is recommended, the largest is no reference."""
     session = session_of("table1/experiment-2")
-    compared = compare(session, "offsets", "lengths")
+    compared = compare(session, "offsets", "lengths", judgement=table1.judgement)
     assert compared.recommendation.model == "full"
     assert compared.best.model == "lengths"
     assert compared.assessment.of_kind("recommended")

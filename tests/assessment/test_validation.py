@@ -229,9 +229,6 @@ def test_another_gauge_has_its_own_noise(plan, sigma_um, seed):
 def test_a_session_with_other_offsets_is_refused(paper, experiment_3):
     with pytest.raises(SessionError, match="not measured with the offsets to enter"):
         validate_calibration(paper, experiment_3.with_controller(np.zeros(3)))
-
-
-def test_offsets_of_a_doubtful_calibration_are_not_to_be_entered(paper, experiment_3):
     assessment = assessment_of(paper)
     doubtful = replace(assessment.decision, verdict="review")
     calibration = replace(paper, assessment=replace(assessment, decision=doubtful))
