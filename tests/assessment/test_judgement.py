@@ -20,7 +20,6 @@ from orthocal import (
     Choice,
     Gauge,
     SolverOptions,
-    assess_tool,
     calibrate,
     check_session,
     compare_models,
@@ -325,16 +324,6 @@ def test_residuals_are_compared_with_the_stated_noise_and_rounding():
     (excess,) = (f for f in find_fit_findings(calibration) if f.kind == "model error")
     assert calibration.gauges[0].noise.residual_sigma > 1.15 * floor
     assert "the stated scatter of the gauge (0.005 mm)" in excess.text
-
-
-def test_the_tool_error_is_that_of_the_accuracy():
-    calibration = calibrated("workshop", "full", **UNJUDGED)
-    tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
-    unknown = accuracy.after.sizes.reported.rms
-    known = accuracy.measure(accuracy.deviation_with_entries).reported.rms
-    assert tool.entered == pytest.approx(math.hypot(known, unknown), rel=1e-9)
-    assert tool.compensated == pytest.approx(unknown, rel=1e-9)
-    assert tool.region == "±60 mm"
 
 
 def test_a_robot_without_a_tool_is_out_of_reach(table1):
