@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibrated import plan_of, session_of
-from commands import orthocal as run
 from gauges import with_gauges
 from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_session
 from planned import quick_plan
@@ -239,24 +238,6 @@ def test_the_evidence_of_an_amount_does_not_depend_on_the_order_of_the_gauges(cy
             assert anomaly.explanation.amount == pytest.approx(0.1e-3, abs=0.02e-3)
         found.append(anomaly.log_evidence)
     assert found[0] == pytest.approx(found[1], rel=1e-6)
-
-
-def test_a_sigma_in_a_wrong_unit_is_the_only_finding(cycles):
-    wrong = cycles.with_gauge(replace(cycles.gauge, sigma=1e-3, resolution=1e-5))
-    assert [found.kind for found in anomalies(wrong)] == ["sigma too large"]
-    unknown = cycles.with_gauge(replace(cycles.gauge, sigma=5e-3, resolution=None))
-    assert [found.kind for found in anomalies(unknown)] == ["sigma too large"]
-
-
-def test_the_command_prints_the_findings(root, tmp_path):
-    folder = root / "examples/raw-cycles"
-    (tmp_path / "session.yaml").write_text((folder / "session.yaml").read_text())
-    rows = (folder / "readings.csv").read_text().replace("x_max,2,0.44", "x_max,2,-0.44")
-    (tmp_path / "readings.csv").write_text(rows)
-    odd = run("check", tmp_path)
-    assert odd.returncode == 3
-    assert odd.stdout.startswith("Check these readings first.")
-    assert "Next: If so, write +0.44 instead of -0.44." in odd.stdout
 
 
 NAMED = [
