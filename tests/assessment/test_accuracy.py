@@ -154,7 +154,6 @@ def test_cells_have_the_values_of_the_polynomial_through_the_points(orthoglide):
 
 
 def test_the_95th_percentile_is_that_of_many_points(orthoglide):
-    """125 points against a grid of 27,000."""
     workspace = cube(orthoglide, half_side=0.06)
     middle = tool_at_zero(orthoglide)
 
@@ -171,7 +170,6 @@ def test_the_95th_percentile_is_that_of_many_points(orthoglide):
 
 
 def test_only_a_rigid_motion_is_removed(workspace):
-    """Stretching along an axis remains."""
     rng = np.random.default_rng(0)
     points = workspace.points
     motion = rng.normal(size=3) + np.cross(rng.normal(size=3), points)
@@ -259,7 +257,6 @@ def sweep():
 
 
 def test_the_tool_is_where_pinocchio_places_it(sweep):
-    """The calibrated pin.Model, its loops closed by Pinocchio, at the commanded drives."""
     calibration = sweep["lengths"]
     machine = calibration.robot.with_errors(calibration.errors)
     points = np.array([[0.0, 0.0, 0.0], [0.04, -0.05, 0.03]])
@@ -308,7 +305,6 @@ def test_machines_within_their_tolerances_have_no_other_scale():
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e-4, 3e-4])
 def test_noise_does_not_increase_the_tolerance_scale(sigma):
-    """A machine without errors except one offset."""
     session = simulate_session(plan_of("raw-cycles"), {"x_slide.offset": 1e-3}, sigma=sigma).session
     assert find_tolerance_scale(session).factor == 1.0
 
@@ -329,7 +325,6 @@ def test_the_tolerance_scale_is_the_factor_of_drawn_errors():
 
 @pytest.mark.usefixtures("without_sensor_gains")
 def test_figures_at_the_tool_are_those_of_the_stated_workspace(tmp_path):
-    """Tool error, correction table and LinuxCNC module of a machine with a box of its own."""
     box = np.array([[-0.05, 0.06], [-0.06, 0.05], [-0.07, 0.04]])
     robot = make_robot(Orthoglide(workspace=tuple(map(tuple, box))), tmp_path / "mine")
     session = simulate_session(paper_plan(robot, Equipment()), {"x_slide.offset": 1e-3}, seed=1)
