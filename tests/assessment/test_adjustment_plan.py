@@ -36,7 +36,6 @@ SEED = 8
 
 
 def machine_of(plan, seed):
-    """Errors of a machine, and its calibration from simulated readings."""
     errors = draw_errors(plan.robot, plan.robot.parameters.patterns("full"), seed=seed)
     session = simulate_session(plan, errors, seed=seed, sigma=3e-6).session
     return errors, calibrate(session, **UNJUDGED)
@@ -102,7 +101,6 @@ def test_each_printed_tool_error_is_visibly_lower(plan, planned):
 
 
 def search_of(calibration):
-    """Search for adjustments, with all feet as candidates."""
     tool = find_tool(calibration)
     candidates = find_adjustments(calibration.robot)
     return _Search(calibration, tool, candidates, calibration.assessment.tool.compensated)
