@@ -67,7 +67,6 @@ def plan():
 
 
 def measure(plan, model="offsets", *, truth=TRUTH, seed=3, sigma=NOISE):
-    """Calibration of a machine read by a plan."""
     session = simulate_session(plan, truth, seed=seed, sigma=sigma).session
     return calibrate(session, model, **UNJUDGED)
 
@@ -83,7 +82,6 @@ def calibration(plan):
 
 @pytest.fixture
 def found(calibration):
-    """Backlash to enter, by the letter of its drive."""
     return {e.drive[0]: e for e in calibration.assessment.backlash}
 
 
@@ -175,7 +173,6 @@ def test_the_scene_shows_the_largest_error_and_the_entered_backlash(calibration,
 
 
 def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calibration):
-    """Its uncertainty is its value; it must change the tool by a third of the remaining error."""
     tool = find_tool(calibration)
     index = next(i for i, p in enumerate(calibration.parameters) if p.name == "x_slide.backlash")
     p = calibration.parameters[index]
@@ -244,7 +241,6 @@ def test_a_session_that_states_no_compensation_is_asked_for_it(calibration):
 
 
 def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
-    """The offsets were entered, the backlash was not."""
     entered = plan.with_controller(entered_offsets(calibration).round(6))
     session = simulate_session(entered, TRUTH, seed=4, sigma=NOISE).session
     validation = validate_calibration(
