@@ -50,7 +50,6 @@ def cycles():
 
 
 def test_the_complete_model_is_recommended_for_table_1(table1):
-    """Residuals of offsets are ten times the noise of the dial."""
     assert table1.recommendation.model == "full"
     assert table1.best is table1["full"]
     assert [r.model for r in table1] == ["offsets", "lengths", "full"]
@@ -99,7 +98,6 @@ def test_compare_and_calibrate_recommend_the_same_model(name, request):
 
 
 def test_doubtful_readings_get_no_recommendation(raw_cycles):
-    """Neither a model nor a tool error, in text and JSON; `calibrate` recommends none, too."""
     session = raw_cycles.select([r for r in raw_cycles.readings if r.cycle <= 2])
     sides = [-1.0 if r.setup == "yx" else 1.0 for r in session.readings]
     session = session.with_values(session.values * sides)
@@ -178,7 +176,6 @@ COARSE, FINE = Gauge(20e-6), Gauge(2e-6)
 
 
 def scores_of(session, models):
-    """Results by model; the readings are not judged."""
     noises = find_known_noises(session)
     return {
         m: score_model(build_problem(session, model=m), noises=noises, options=QUICK)
@@ -187,7 +184,6 @@ def scores_of(session, models):
 
 
 def read_with_two_gauges(fine_setups, *, scale, seed):
-    """A drawn machine, read with a coarse gauge and a fine one."""
     session = session_of("raw-cycles")
     session = with_gauges(session, {"coarse": COARSE, "fine": FINE}, fine_setups)
     problem = build_problem(session, model="full", prior=True)
@@ -334,7 +330,6 @@ def test_an_unstated_noise_is_unknown(experiment_2):
 
 
 def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
-    """Each setup of leg x is needed for one offset."""
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "zx", "xz"))
     session = replace(raw_cycles, readings=rows)
     found = compare(session, "offsets", judgement=SOUND)
@@ -347,7 +342,6 @@ def test_an_unknown_model_is_refused(experiment_2):
 
 
 def test_an_undetermined_offset_has_a_prior_in_all_models(raw_cycles):
-    """One setup does not determine three offsets."""
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
     session = replace(raw_cycles, readings=rows)
     found = compare(session, "offsets", "lengths", judgement=SOUND)
