@@ -31,13 +31,11 @@ ERRORS = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "y_slide.backlash": 5
 
 @pytest.fixture(scope="module")
 def session():
-    """A machine with backlash; its robot has the effects of its YAML."""
     return simulate_session(effect_plan("backlash", setups=FEW), ERRORS, seed=4).session
 
 
 @pytest.fixture(scope="module")
 def compared(session):
-    """Comparison of backlash with no effect."""
     return compare_effects(session.with_effects(["backlash"]))
 
 
@@ -103,7 +101,6 @@ def test_an_effect_that_cannot_act_does_not_change_the_evidence(session):
 
 @pytest.fixture
 def slack():
-    """Readings of a machine with an effect of another package, whose YAML does not name it."""
     registry.register_effect(Slack)
     truth = {"y_leg.length": 40e-6, "x_slide.slack": 30e-6, "y_slide.slack": 50e-6}
     machine = effect_plan(keys="thermal: {}", setups=FEW).with_effects(["slack"])
@@ -135,7 +132,6 @@ def test_effects_are_compared_only_where_all_conditions_are_stated(session):
 
 
 def test_omitted_setups_are_predicted_by_conditioning(session):
-    """By the conditional mean of the joint normal distribution of all entries."""
     model = LinearModel(session)
     near = model.most_likely(session.values)
     about = model.linearise(near.theta, (), near.passive, keep_jacobian=True)
