@@ -94,7 +94,6 @@ VERDICTS |= dict.fromkeys(
 
 @pytest.fixture(scope="module")
 def cases(cycles, table1):
-    """Sound and spoilt sessions by the names of their cases."""
     cycles = cycles.select([r for r in cycles.readings if r.cycle <= 2])
     largest = int(np.abs(cycles.values).argmax())
     errors = {"y_slide.backlash": 50e-6, "x_slide.offset": 0.1e-3}
@@ -115,7 +114,6 @@ def cases(cycles, table1):
 
 @pytest.mark.parametrize("case", ["sound", "experiment 1 as printed"])
 def test_every_command_has_the_same_verdict(cases, case, judged, tmp_path):
-    """In the document, as exit code, and by what is exported. Each judges the readings once."""
     session, expected = cases[case], VERDICTS[case]
     write_session(session, tmp_path / "session")
     code = EXIT_CODES[expected]
@@ -139,14 +137,12 @@ def test_every_command_has_the_same_verdict(cases, case, judged, tmp_path):
 
 @pytest.mark.parametrize("case", [c for c in VERDICTS if c != "sound"])
 def test_a_case_has_its_verdict(cases, case):
-    """Findings are of known kinds with numbers of stated units."""
     checked = check_session(cases[case])
     assert checked.decision.verdict == VERDICTS[case]
     require_known_findings(checked.to_document()["findings"])
 
 
 def test_the_judgement_does_not_depend_on_the_model(cases, tmp_path):
-    """It is that of a check, and is loaded again from a file."""
     session = cases["reversed sign"]
     checked = check_session(session)
     assert checked.decision.verdict == "review"
@@ -159,7 +155,6 @@ def test_the_judgement_does_not_depend_on_the_model(cases, tmp_path):
 
 
 def of_readings(assessment):
-    """Documents of the findings that decide about the readings."""
     return [f.to_document() for f in assessment.findings if f.severity != "note"]
 
 
@@ -235,7 +230,6 @@ def test_the_next_step_of_a_decision_is_about_each_finding(cycles):
 
 @pytest.fixture
 def judged(monkeypatch):
-    """Sessions in the order in which they are judged."""
     sessions = []
 
     def count(session):
@@ -248,7 +242,6 @@ def judged(monkeypatch):
 
 
 def test_readings_are_judged_once(table1, judged):
-    """A stated judgement replaces it, with the same result."""
     session = table1["2"]
     judgement = judge_session(session)
     stated = calibrate(session, "offsets", judgement=judgement, **QUICK)
