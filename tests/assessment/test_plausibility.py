@@ -49,7 +49,6 @@ def cycles():
 
 
 def kinds(session):
-    """Kinds of implausible findings."""
     return [d.kind for d in find_implausible(session)]
 
 
@@ -70,7 +69,6 @@ def test_readings_in_inches_are_found(session):
 
 
 def test_small_readings_in_metres_are_found():
-    """None of them is a hundredth of a step of the gauge."""
     errors = {name: 0.1 * error for name, error in TRUTH.items()}
     session = simulate_session(plan_of("workshop"), errors, seed=1).session
     metres = session.with_values(np.round(session.values * 1e-3, 9))
@@ -105,7 +103,6 @@ def test_the_dimensions_of_the_machine_are_printed():
 
 
 def small_plan(folder, postures):
-    """The paper's plan with other postures, for an Orthoglide with legs of 295 mm."""
     write_orthoglide(folder / "machine", 0.295, travel=(0.05, 0.39))
     plan = plans.paper() | {"robot": "machine"}
     plan |= {"gauge": {"sigma_mm": 0.01, "resolution_mm": 0.01}, "postures": postures}
@@ -113,7 +110,6 @@ def small_plan(folder, postures):
 
 
 def test_postures_of_a_machine_of_other_dimensions_are_found(tmp_path, plan, session):
-    """Joint coordinates and readings of the packaged machine."""
     joints = {
         name: {"joints_mm": [float(v) for v in np.round(p.drives * 1e3, 3)]}
         for name, p in plan.postures.items()
