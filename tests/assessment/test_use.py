@@ -56,7 +56,6 @@ MACHINES = 24
 
 
 def state_use(folder, use):
-    """Add conditions of use to the YAML of a machine."""
     text = (folder / "machine.yaml").read_text()
     (folder / "machine.yaml").write_text(text.replace("\n  tcp: ", f"\n  {use}\n  tcp: "))
     return folder
@@ -214,7 +213,6 @@ def test_tool_errors_are_those_of_sampled_machines_under_sampled_conditions(cali
 
 
 def summarise_without_backlash(calibration, workspace):
-    """Tool errors of a controller that does not compensate backlash."""
     placed = place_tool(calibration, workspace)
     return summarise_tool(calibration, assess_placed(calibration, placed, backlash=()))
 
