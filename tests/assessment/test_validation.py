@@ -65,7 +65,6 @@ def plan():
 
 @pytest.fixture(scope="module")
 def paper():
-    """Calibration of the paper's Experiment 2."""
     return calibrated("table1/experiment-2")
 
 
@@ -75,7 +74,6 @@ def experiment_3():
 
 
 def draw_machine(robot, seed):
-    """Errors of a machine at tolerance, with offsets of about 2 mm."""
     errors = draw_errors(robot, machine_errors(robot), seed=seed)
     for drive in robot.drives:
         errors[f"{drive.name}.offset"] *= 0.4
@@ -98,7 +96,6 @@ def measure_again(plan, calibration, errors, *, seed, **options):
 
 
 def misread(session):
-    """The session with a dial misread by 0.3 mm in its fifth reading."""
     return session.with_values(session.values + 0.3e-3 * (np.arange(len(session.values)) == 4))
 
 
@@ -150,7 +147,6 @@ def test_a_larger_tool_error_than_before_is_stated_beside_the_confirmation(paper
 
 @pytest.mark.slow
 def test_deviations_with_priors_are_as_large_as_expected():
-    """Machines drawn by the tolerances, measured twice; other mountings, nothing entered."""
     plan, sizes = session_of("table1/experiment-2"), []
     for seed in range(MACHINES):
         errors = draw_machine(plan.robot, seed)
@@ -211,7 +207,6 @@ def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
 
 @pytest.mark.parametrize(("sigma_um", "seed"), [(2.0, 3), (50.0, 5)])
 def test_another_gauge_has_its_own_noise(plan, sigma_um, seed):
-    """The second session is read with another dial than the first."""
     first = simulate_session(plan, TRUTH, seed=seed).session
     before, _ = identify(first, "full", **QUICK)
     other = plan.with_gauge(replace(plan.gauge, sigma=sigma_um * 1e-6, resolution=None))
@@ -278,7 +273,6 @@ def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3)
 
 
 def test_several_sessions_are_validated_together(plan):
-    """They are joined, each with separate gauge zeros and the offsets to enter."""
     errors, _, calibration = calibrated_machine("raw-cycles", None, 3)
     days = [measure_again(plan, calibration, errors, seed=s) for s in (2, 3)]
     both = validate_calibration(calibration, days)
@@ -438,7 +432,6 @@ def test_number_and_limit_are_printed_differently():
     ],
 )
 def test_values_to_enter_after_a_mistake(plan, mistake, kind, by_calibration):
-    """Those of the calibration if they were entered wrongly, otherwise none."""
     errors, _, calibration = calibrated_machine("raw-cycles", None, 3)
     right = entered_offsets(calibration)
     measured = simulate_session(plan.with_controller(mistake(right)), errors, seed=7).session
