@@ -162,7 +162,6 @@ def test_without_a_stated_noise_no_change_is_found(experiment_2):
 
 
 def estimate_change(session, drive):
-    """Change of a drive's offset between two sessions and its standard deviation, [m]."""
     model = LinearModel(session)
     search = _Search(session, model)
     family = next(f for f in changes_between_sessions(model) if not f.known)
