@@ -34,7 +34,6 @@ def plan():
 
 
 def measure(plan, drive, row, size, *, seed):
-    """Two sessions of a machine with offsets entered; steps are lost in the second one."""
     errors, first = sound_machine(plan, seed, entered=True)
     second = simulate_session(first, errors, seed=seed + 500).session
     again = lose_steps(second, errors, drive, row, size)
