@@ -57,7 +57,6 @@ def both_orders(session, fine, coarse):
 
 
 def anomalies(session):
-    """Findings that decide about the readings of a session."""
     return [f for f in check_session(session).findings if f.severity != "note"]
 
 
@@ -111,7 +110,6 @@ def test_a_factor_is_named_only_if_the_dial_can_show_the_corrected_readings(cycl
 
 
 def test_the_likeliest_of_further_wrong_readings_are_named(cycles):
-    """Of five wrong readings some are found; the action repeats one of the others."""
     _, *wrong = [rows[4] for rows in Rows(cycles).setups.values()][::-1]
     values = cycles.values
     values[wrong] += np.array([2.2, -0.9, 1.9, -2.7, 1.3]) * 1e-3
@@ -226,7 +224,6 @@ def test_errors_of_silent_rows_are_amounts_without_prior(cycles):
 
 @pytest.mark.parametrize("kind", ["outlier", "displaced gauge"])
 def test_the_evidence_of_an_amount_does_not_depend_on_the_order_of_the_gauges(cycles, kind):
-    """Amounts are compared with the noise of the gauge of their readings."""
     found = []
     rows = [i for i, r in enumerate(cycles.readings) if r.setup == "xz"]
     values = cycles.values
@@ -250,7 +247,6 @@ NAMED = [
 
 @pytest.mark.slow
 def test_clear_mistakes_are_named():
-    """The benchmark prints the shares of all mistakes."""
     three = sound_session(plan_of("raw-cycles"), 3, entered=False)
     session = three.select([r for r in three.readings if r.cycle <= 2])
     made = {name: m for name, _, m in make_mistakes(session, 0, sizes=()) if name in NAMED}
