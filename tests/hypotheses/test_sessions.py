@@ -132,7 +132,6 @@ WAYS = {
 
 
 def enter(way, drives):
-    """Offsets in the controller if some drives' are entered wrongly."""
     active = ENTERED.copy()
     active[list(drives)] = WAYS[way][1][list(drives)]
     return active
@@ -188,7 +187,6 @@ def test_wrong_offsets_are_listed_once():
 
 @pytest.fixture(scope="module")
 def sided():
-    """Each posture is approached from both sides."""
     plan = effect_plan("backlash")
     return plan.with_gauge(replace(plan.gauge, sigma=5e-6, resolution=10e-6))
 
@@ -297,7 +295,6 @@ def test_the_readings_of_an_unfinished_session_are_searched(raw_cycles):
 
 
 def test_one_reversed_reading_of_three_is_no_reversed_setup(plan):
-    """The smaller change is more likely."""
     named = 0
     for seed in range(2):
         session = sound_session(plan, seed, entered=False)
@@ -455,7 +452,6 @@ def test_the_order_in_which_sessions_are_joined_does_not_matter(plan):
 
 
 def at(session, day):
-    """The session with the time of a day."""
     conditions = Conditions(time=datetime(2026, 1, day))
     return session.select([replace(r, conditions=conditions) for r in session.readings])
 
