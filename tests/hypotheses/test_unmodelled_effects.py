@@ -38,12 +38,10 @@ GEOMETRY = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "z_slide.offset": -
 
 @pytest.fixture(scope="module")
 def plan():
-    """Each posture is approached from both sides while it gets warmer."""
     return effect_plan(setups=FEW)
 
 
 def read(plan, effect, errors):
-    """Readings of a machine with an effect, which the model lacks."""
     machine = plan.with_effects([effect] if effect else [])
     return simulate_session(machine, GEOMETRY | errors, seed=4).session.with_effects([])
 
@@ -122,7 +120,6 @@ def test_an_approach_from_one_side_shows_no_backlash(plan):
 
 @pytest.fixture
 def slack():
-    """Plan of a machine with an effect of another package."""
     registry.register_effect(Slack)
     yield effect_plan("slack", keys="slack: {lead_mm: 10}", setups=FEW)
     registry.unregister_effect("slack")
