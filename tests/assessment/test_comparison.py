@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import SOUND, calibrated, plan_of, session_of
+from calibrated import SOUND, plan_of, session_of
 from gauges import with_gauges, with_scatter
 
 from orthocal import calibrate, draw_errors, join_sessions, simulate_session, summarize
@@ -84,17 +84,25 @@ RECOMMENDED = {"table1": ("full", -116.95), "cycles": ("offsets", 11.8)}
 
 
 @pytest.mark.parametrize("name", RECOMMENDED)
-def test_compare_and_calibrate_recommend_the_same_model(name, request):
+def test_compare_and_calibrate_state_the_same_model_and_tool_error(name, request):
     compared = request.getfixturevalue(name)
     model, evidence = RECOMMENDED[name]
     assert compared.recommendation.model == model
     assert compared.recommendation.log_evidence_of("offsets") == pytest.approx(evidence, abs=0.05)
     session, judgement = session_of(EXAMPLES[name]), compared.judgement
-    calibration = calibrate(session, solver="variable-projection", judgement=judgement)
-    (first,) = compared.assessment.of_kind("recommended")
-    (second,) = calibration.assessment.of_kind("recommended")
-    assert model in first.text
-    assert model in second.text
+    calibration = calibrate(session, model, solver="variable-projection", judgement=judgement)
+    both = compared.assessment, calibration.assessment
+    for assessment in both:
+        (finding,) = assessment.of_kind("recommended")
+        assert model in finding.text
+    first, second = (assessment.of_kind("tool error") for assessment in both)
+    assert [f.text for f in first] == [f.text for f in second]
+    assert both[0].tool.box == both[1].tool.box
+    row = next(r for r in summarize(compared).splitlines() if r.split()[:1] == [model])
+    assert tool_mm(both[1].tool.entered) in row
+    for figure in ("now", "entered", "compensated"):
+        values = [getattr(assessment.tool, figure) for assessment in both]
+        assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
 def test_doubtful_readings_get_no_recommendation(raw_cycles):
@@ -129,19 +137,6 @@ def test_residuals_of_offsets_repeat(experiment_2):
     assert repeat.numbers["correlation"] == found.repetition.correlation
     (excess,) = found.assessment.of_kind("model error")
     assert excess.numbers["ratio"] == pytest.approx(9.8, abs=0.05)
-
-
-def test_the_tool_error_is_that_of_calibrate(cycles):
-    compared, calibration = cycles, calibrated("raw-cycles", cycles.best.model)
-    (first,) = compared.assessment.of_kind("tool error")
-    (second,) = calibration.assessment.of_kind("tool error")
-    assert first.text == second.text
-    assert compared.assessment.tool.box == calibration.assessment.tool.box
-    row = next(r for r in summarize(compared).splitlines() if r.split()[:1] == [cycles.best.model])
-    assert tool_mm(calibration.assessment.tool.entered) in row
-    for name in ("now", "entered", "compensated"):
-        values = [getattr(a.tool, name) for a in (compared.assessment, calibration.assessment)]
-        assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
 def test_the_scores_of_table_1_solved_by_hand(table1):
