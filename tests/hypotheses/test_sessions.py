@@ -383,7 +383,8 @@ def test_a_dial_that_is_stuck_for_many_readings_is_one_finding(raw_cycles):
 def test_memory_is_linear_in_the_readings(raw_cycles):
     """All families consider all readings of a setup. The first search fills caches."""
     rng, peaks = np.random.default_rng(0), []
-    for count in (60, 90, 180):
+    find_anomalies(read_often(raw_cycles, 60, rng))
+    for count in (90, 180):
         large = read_often(raw_cycles, count, rng)
         values = large.values
         values[count // 3] += 1e-3
@@ -392,7 +393,7 @@ def test_memory_is_linear_in_the_readings(raw_cycles):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert [a.explanation.rows for a in found.found] == [(count // 3,)]
-    assert peaks[2] < 2.5 * peaks[1]
+    assert peaks[1] < 2.5 * peaks[0]
 
 
 def test_a_change_that_may_be_zero_is_no_cause(plan):
