@@ -372,10 +372,12 @@ def test_accuracy_is_under_stated_conditions(folder, calibration):
 
 
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, calibration):
-    points = np.array([[0.0, 0.0, 0.0], [10.0, -20.0, 5.0], [-15.0, 25.0, 10.0], [5.0, 5.0, -30.0]])
+    points = np.array(
+        [[1.0, 1.0, 1.0], [12.0, 18.0, 5.0], [18.0, 3.0, 14.0], [5.0, 9.0, 19.0]]
+    )  # of one octant
     lines = [f"N{n} G0 X{x} Y{y} Z{z}" for n, (x, y, z) in enumerate(points, start=1)]
     (folder / "part.ngc").write_text("\n".join(["G21", *lines, ""]))
-    (folder / "point.ngc").write_text("G21\nN1 G0 X0 Y0 Z0\n")
+    (folder / "point.ngc").write_text("G21\nN1 G0 X1 Y1 Z1\n")
 
     def correct(file, *options):
         """A corrected program, the comments at its top, and the notes."""
