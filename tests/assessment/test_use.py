@@ -372,9 +372,8 @@ def test_accuracy_is_under_stated_conditions(folder, calibration):
 
 
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, calibration):
-    points = np.array(
-        [[1.0, 1.0, 1.0], [12.0, 18.0, 5.0], [18.0, 3.0, 14.0], [5.0, 9.0, 19.0]]
-    )  # of one octant
+    # within one box of the correction field
+    points = np.array([[1.0, 1.0, 1.0], [12.0, 18.0, 5.0], [18.0, 3.0, 14.0], [5.0, 9.0, 19.0]])
     lines = [f"N{n} G0 X{x} Y{y} Z{z}" for n, (x, y, z) in enumerate(points, start=1)]
     (folder / "part.ngc").write_text("\n".join(["G21", *lines, ""]))
     (folder / "point.ngc").write_text("G21\nN1 G0 X1 Y1 Z1\n")
