@@ -192,7 +192,8 @@ def _describe_entries(
         if down := [d.name for d in drives if d.direction < 0]:
             they = "it counts" if len(down) == 1 else "they count"
             text += (
-                f" In another controller the sign is opposite for {', '.join(down)}: {they} down."
+                f" If the controller is not LinuxCNC, enter {', '.join(down)} with the opposite "
+                f"sign: {they} down."
             )
     if backlash := describe_trims(new.robot, new.compensation):
         text += (

@@ -165,8 +165,9 @@ class BallBar(ToolSensor):
             "Before you connect the bar, hold it at the tool's ball and turn it by hand through "
             "the directions of this setup. It must touch neither the platform nor a rod.",
             f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}. If "
-            "the dial comes to an end of its range in a posture, move the fixed ball that far and "
-            "begin its setups again.",
+            "the dial comes to an end of its range in a posture, move the fixed ball along the "
+            "bar, write its new place into centre_mm, make this sheet again, and begin the setup "
+            "again.",
             "Make the bar longer with your hand. The reading must grow. If it falls, enter "
             "every reading of this setup with the opposite sign.",
         )

@@ -210,7 +210,7 @@ def headline(orthoglide):
 
 def test_a_plan_is_summarised(headline):
     assert isinstance(headline, MeasuringPlan)
-    assert "Expected tool error with all identified errors corrected: " in summarize(headline)
+    assert "with all identified errors corrected " in summarize(headline)
     assert "Largest contributions" in summarize(headline, details=True)
 
 

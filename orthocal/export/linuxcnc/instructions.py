@@ -162,6 +162,16 @@ def _compensation_lines(joint: int, home: JointHome) -> list[str]:
     return lines
 
 
+_IN_MODULE = (
+    "The module contains half\nof the change of the backlash, which depends on the sign of "
+    "HOME_LATCH_VEL; HOME_OFFSET does not change"
+)
+_IN_HOME_OFFSET = (
+    "Half of the change of\nthe backlash is subtracted from HOME_OFFSET if HOME_LATCH_VEL is "
+    "positive, and added if it is negative"
+)
+
+
 def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: bool = False) -> str:
     """Paragraph about BACKLASH and COMP_FILE; empty without them.
 
@@ -188,9 +198,7 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
         )
         paragraphs.append(
             f"**Backlash:** {listed}.\nLinuxCNC compensates it by the lines BACKLASH, or by the "
-            f"columns of COMP_FILE. {'The module' if module else 'HOME_OFFSET'} contains half of\n"
-            "the backlash, with the sign of HOME_LATCH_VEL"
-            f"{': HOME_OFFSET does not change' if module else ''}. The numbers\n"
+            f"columns of COMP_FILE. {_IN_MODULE if module else _IN_HOME_OFFSET}. The numbers\n"
             "are for the signs stated here. If one differs in your INI file, do not change it: "
             "export again with `--ini`."
         )

@@ -211,8 +211,8 @@ def _programs(session: Session, options: ProgramOptions | None, *, with_bar: boo
     stops = "stop (M0) in the alignment posture and at each reading"
     if options.automatic:
         stops = (
-            "stop (M0) where you mount the gauge, set its dial or hold its plunger. A logger reads "
-            "the gauge: its values are in the order of the tables"
+            "stop (M0) where you mount the gauge, set its dial or hold its plunger up. A logger "
+            "reads the gauge: its values are in the order of the tables"
         )
     return paragraph(
         f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "

@@ -160,11 +160,17 @@ def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
     """Expected tool error with its conditions, and the readings that are impossible at first."""
     first, workspace = plan.first_round, plan.forecast.workspace
     expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.before))
-    figures = f"now {now}, {before} after this measurement, {expected} after a second one"
+    corrected = "with all identified errors corrected"
+    figures = (
+        f": now {now}; {corrected} {before} after this measurement, {expected} after a second one"
+    )
     if plan.complements_session:
-        figures = f"{expected} with these readings added, {now} with those of the session alone"
+        figures = (
+            f" {corrected}: {expected} with these readings added, {now} with those of the session "
+            "alone"
+        )
     lines = [
-        f"Expected tool error with all identified errors corrected: {figures}.",
+        f"Expected tool error{figures}.",
         describe_aligned(workspace.words, stated_use(plan.forecast.robot)),
     ]
     if first.lost > SOME_LOST:
