@@ -17,7 +17,6 @@ from orthocal.assessment.recommendation import STRONG, Recommendation, recommend
 from orthocal.assessment.scores import score_model
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.comparison import describe_recommendation
-from orthocal.errors import ParameterError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
@@ -329,11 +328,6 @@ def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
     session = replace(raw_cycles, readings=rows)
     found = compare(session, "offsets", judgement=SOUND)
     assert np.isnan(found["offsets"].exact.prediction_error).any()
-
-
-def test_an_unknown_model_is_refused(experiment_2):
-    with pytest.raises(ParameterError, match="'all' is not a model"):
-        compare_models(experiment_2, models=["all"])
 
 
 def test_an_undetermined_offset_has_a_prior_in_all_models(raw_cycles):
