@@ -258,11 +258,6 @@ def test_sessions_of_the_calibration_are_refused(experiment_3):
             validate_calibration(both, used)
 
 
-def test_another_robot_is_refused(paper, experiment_3, biglide):
-    with pytest.raises(SessionError, match="is of robot 'biglide'"):
-        validate_calibration(paper, replace(experiment_3, robot=biglide))
-
-
 def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3):
     session = session_of("table1/experiment-2")
     few = session.select([r for r in session.readings if r.setup in ("yx", "xy", "xz")])
