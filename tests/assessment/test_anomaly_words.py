@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
+from calibrated import session_of
 
-from orthocal import load_session
+from orthocal import join_sessions
 from orthocal.assessment.words.anomalies import _text, describe_anomalies
 from orthocal.assessment.words.remedies import advise, advise_about_sessions, advise_repetition
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
 from orthocal.units import MM
 
 
+@pytest.fixture(scope="module")
+def session():
+    return session_of("raw-cycles")
+
+
 def describe_alternatives(session, explanation, alternative):
-    """The finding about an anomaly with two explanations."""
     anomaly = Anomaly(explanation, 9.0, None, alternatives=(alternative,))
     found = Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
     (finding,) = describe_anomalies(session, found)
@@ -23,9 +30,8 @@ def describe_alternatives(session, explanation, alternative):
 
 
 @pytest.mark.parametrize("kind", get_args(AnomalyKind))
-def test_every_kind_has_a_sentence(root, kind):
+def test_every_kind_has_a_sentence(session, kind):
     """A kind without one would end a command with an internal error."""
-    session = load_session(root / "examples/raw-cycles")
     setup, drive = next(iter(session.setups)), session.robot.drives[0].name
     explanation = Explanation(
         kind,
@@ -54,18 +60,18 @@ def test_every_kind_has_a_sentence(root, kind):
         (0.44, {"factor": -1.0}, "write -0.44 instead of +0.44."),
     ],
 )
-def test_a_corrected_reading_has_the_micrometres_of_the_stated_one(root, stated, change, advised):
+def test_a_corrected_reading_has_the_micrometres_of_the_stated_one(
+    session, stated, change, advised
+):
     """Points are metres away from the zero of their station."""
-    session = load_session(root / "examples/raw-cycles")
     first, *others = session.readings
     session = replace(session, readings=(replace(first, value=stated * MM), *others))
     explanation = Explanation("misread dial", "reading", rows=(0,), **change)
     assert advised in advise(session, explanation)
 
 
-def test_offsets_of_a_session_are_not_compared_with_home_offset(root):
+def test_offsets_of_a_session_are_not_compared_with_home_offset(session):
     """LinuxCNC displays no number that equals them; backlash is BACKLASH."""
-    session = load_session(root / "examples/raw-cycles")
     drive = session.robot.drives[0].name
     for kind, key, differs in (
         ("offsets not entered", "controller.offsets_mm", True),
@@ -78,9 +84,8 @@ def test_offsets_of_a_session_are_not_compared_with_home_offset(root):
         assert ("joints.ini" in action) == differs
 
 
-def test_an_action_that_costs_no_reading_comes_first(root):
+def test_an_action_that_costs_no_reading_comes_first(session):
     """Calibrate with an effect; reverse signs of setups; read one of many again for their unit."""
-    session = load_session(root / "examples/raw-cycles")
     sign = Explanation("reversed sign", "reading", rows=(3,), factor=-1.0)
     setup, other = (
         Explanation("reversed sign", "setup", rows=(row,), setups=(name,), factor=-1.0)
@@ -112,9 +117,18 @@ def test_an_action_that_costs_no_reading_comes_first(root):
         assert finding.action.startswith(first)
 
 
-def test_a_setup_whose_gauge_may_have_moved_is_read_again(root):
+def test_a_wrong_reading_is_not_read_again_after_other_offsets_were_entered(session):
+    second = session.with_controller(np.array([0.5e-3, -0.2e-3, 0.1e-3]))
+    outlier, line = Explanation("outlier", "reading", rows=(4,)), session.readings[4].line
+    for other, again in ((session.with_controller(np.zeros(3)), True), (second, False)):
+        action = advise(join_sessions([session, replace(other, sha256="")]), outlier)
+        assert (f"type `repeat {line}`" in action) == again
+        assert ("Do not read it again" in action) != again
+        assert f"`drop {line}` deletes it" in action
+
+
+def test_a_setup_whose_gauge_may_have_moved_is_read_again(session):
     """Also the last one, whose stand is still there."""
-    session = load_session(root / "examples/raw-cycles")
     last = tuple(range(len(session.readings)))[-2:]
     names = (session.readings[last[0]].setup,)
     displaced = Explanation("displaced gauge", "reading", rows=last, names=names)
@@ -123,18 +137,16 @@ def test_a_setup_whose_gauge_may_have_moved_is_read_again(root):
     assert f"type `restart {session.readings[last[0]].line}`" in finding.action
 
 
-def test_the_same_line_of_another_file_is_named(root):
-    session = load_session(root / "examples/raw-cycles/session.yaml")
+def test_the_same_line_of_another_file_is_named(session):
     first, second = (
-        replace(session.readings[0], line=7, file=root / name / "readings.csv") for name in "ab"
+        replace(session.readings[0], line=7, file=Path(name) / "readings.csv") for name in "ab"
     )
     joined = replace(session, readings=(first, second))
     both = Explanation("outlier", "reading", (0, 1))
     assert "type `repeat 7`, likewise the other lines." in advise_repetition(joined, both)
 
 
-def test_changes_between_sessions_that_readings_do_not_distinguish_are_listed(root):
-    session = load_session(root / "examples/raw-cycles")
+def test_changes_between_sessions_that_readings_do_not_distinguish_are_listed(session):
     drive = session.robot.drives[0].name
     missing, twice = (
         Explanation(kind, "session", drives=(drive,), sessions=("second",))

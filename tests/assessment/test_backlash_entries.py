@@ -54,6 +54,8 @@ TRUTH = {
 
 NOISE = 6e-6
 
+LINES = ExportOptions(module=False, latched=(1, 1, 1))
+
 KNOWN = {"judgement": SOUND, "recommendation": Recommendation("full", 1.0, {}, 0.0)}
 """Arguments of an assessment whose readings are sound, and whose model is not in question."""
 
@@ -64,19 +66,26 @@ def plan():
     return plan.with_gauge(replace(plan.gauge, sigma=NOISE)).with_controller(np.zeros(3))
 
 
+def measure(plan, model="offsets", *, truth=TRUTH, seed=3, sigma=NOISE):
+    session = simulate_session(plan, truth, seed=seed, sigma=sigma).session
+    return calibrate(session, model, **UNJUDGED)
+
+
+def answer(calibration):
+    return to_text(render_answer(calibration, saved=Path("out")))
+
+
 @pytest.fixture(scope="module")
 def calibration(plan):
-    return calibrate(
-        simulate_session(plan, TRUTH, seed=3, sigma=NOISE).session, "offsets", **UNJUDGED
-    )
+    return measure(plan)
 
 
-def by_drive(calibration):
+@pytest.fixture
+def found(calibration):
     return {e.drive[0]: e for e in calibration.assessment.backlash}
 
 
-def test_a_backlash_is_entered_where_it_is_determined(calibration):
-    found = by_drive(calibration)
+def test_a_backlash_is_entered_where_it_is_determined(calibration, found):
     for drive, entered in zip("xyz", (True, True, False), strict=True):
         e, p = found[drive], calibration[f"{drive}_slide.backlash"]
         half = expanded_uncertainty(calibration, e)
@@ -85,23 +94,17 @@ def test_a_backlash_is_entered_where_it_is_determined(calibration):
         assert e.enter == (max(p.value, 0.0) if entered else 0.0)
 
 
-def test_every_output_has_the_same_decision(calibration, plan):
-    found = by_drive(calibration)
-    options = ExportOptions(module=False, latched=(1, 1, 1))
-    lines = export_calibration(calibration, "linuxcnc", options=options)
+def test_every_output_has_the_same_decision(calibration, found):
+    lines = export_calibration(calibration, "linuxcnc", options=LINES)
     written = dict(re.findall(r"\[JOINT_(\d)\][^\[]*?BACKLASH = (\S+)", lines["joints.ini"]))
     assert sorted(written) == ["0", "1"]
     for joint, drive in (("0", "x"), ("1", "y")):
-        assert float(written[joint]) * 1e-3 == pytest.approx(
-            round(found[drive].enter, 6), abs=1e-12
-        )
+        assert float(written[joint]) == pytest.approx(round(found[drive].enter / MM, 3))
     half = f"±{expanded_uncertainty(calibration, found['z']) * 1e3:.3f} mm"
     assert f"JOINT_2 ({half})" in lines["README.md"]
-    lags = _find_lags(calibration)
-    assert lags == pytest.approx(
-        0.5 * backlash_changes(calibration, list(found.values())), abs=1e-9
-    )
-    text = to_text(render_answer(calibration, saved=Path("out")))
+    half = 0.5 * backlash_changes(calibration, list(found.values()))
+    assert _find_lags(calibration) == pytest.approx(half, abs=1e-9)
+    text = answer(calibration)
     rows = [r.split() for r in text.splitlines() if r.split()[:1] == ["z_slide"]]
     assert rows[1][2] == "unchanged"
     assert "and this backlash" in text
@@ -112,17 +115,16 @@ def test_a_compensation_table_has_the_same_decision(plan):
     both = plan.with_effects(["backlash", "screw"])
     both = both.with_gauge(replace(both.gauge, sigma=noise, resolution=None))
     truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
-    session = simulate_session(both, truth, seed=3, sigma=noise).session
-    calibration = calibrate(session, "full", **UNJUDGED)
-    found = by_drive(calibration)
-    assert found["x"].enter > 0.0
-    assert found["z"].enter == 0.0
-    options = ExportOptions(module=False, latched=(1, 1, 1), home_offsets=(0.3, 0.3, 0.3))
+    calibration = measure(both, "full", truth=truth, sigma=noise)
+    x, _, z = calibration.assessment.backlash
+    assert x.enter > 0.0
+    assert z.enter == 0.0
+    options = replace(LINES, home_offsets=(0.3, 0.3, 0.3))
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-    for joint, drive in (("0", "x"), ("2", "z")):
+    for joint, entry in (("0", x), ("2", z)):
         rows = np.array([r.split() for r in files[f"joint_{joint}.comp"].splitlines()], float)
         apart = 1e-3 * (rows[:, 1] - rows[:, 2])
-        assert apart == pytest.approx(found[drive].enter, rel=0.05, abs=1e-9)
+        assert apart == pytest.approx(entry.enter, rel=0.05, abs=1e-9)
 
 
 def test_the_tool_error_is_that_with_the_entered_backlash(calibration):
@@ -171,11 +173,9 @@ def test_the_scene_shows_the_largest_error_and_the_entered_backlash(calibration,
 
 
 def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calibration):
-    """Its uncertainty is its value; it must change the tool by a third of the remaining error."""
     tool = find_tool(calibration)
     index = next(i for i, p in enumerate(calibration.parameters) if p.name == "x_slide.backlash")
     p = calibration.parameters[index]
-    free = [q.name for q in calibration.free].index(p.name)
     for scale, entered in ((1.0, True), (0.1, False)):
         covariance = np.array(calibration.model_covariance) * 1e-2
         value = p.value * scale
@@ -186,7 +186,6 @@ def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calib
             model_covariance=covariance,
             parameters=tuple(vague if q is p else q for q in calibration.parameters),
         )
-        assert [q.name for q in vague_at.free][free] == p.name
         (x, *_) = compute_backlash(vague_at, tool)
         assert x.identified < expanded_uncertainty(vague_at, x)
         assert (x.enter == value) is entered
@@ -195,16 +194,14 @@ def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calib
 def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     trims = tuple(JointTrim(e.enter) for e in calibration.assessment.backlash)
     again = replace(plan.with_controller(entered_offsets(calibration).round(6)), compensation=trims)
-    second = calibrate(
-        simulate_session(again, TRUTH, seed=4, sigma=NOISE).session, "offsets", **UNJUDGED
-    )
+    second = measure(again, seed=4)
     found = second.assessment
     assert [e.active for e in found.backlash] == pytest.approx([t.backlash for t in trims])
     assert found.keeps_offsets
     assert not any(e.change for e in found.backlash)
     assert found.tool.without_backlash is None
     assert not is_worth_changing(second, found.backlash, None, None)
-    text = to_text(render_answer(second, saved=Path("out")))
+    text = answer(second)
     assert text.count(" unchanged ") == 3
     assert "Next: nothing to enter" in text or "Next: correct" in text
 
@@ -214,21 +211,15 @@ def test_a_backlash_that_no_reading_shows_keeps_its_compensation(plan):
     to remove what the controller compensates."""
     one_side = plan.select([r for r in plan.readings if r.conditions.approach == "ppp"])
     trims = (JointTrim(20e-6),) * 3
-    found = calibrate(
-        simulate_session(replace(one_side, compensation=trims), TRUTH, seed=3, sigma=NOISE).session,
-        "full",
-        **UNJUDGED,
-    )
+    found = measure(replace(one_side, compensation=trims), "full")
     backlash = found.assessment.backlash
     assert [(e.enter, e.change) for e in backlash] == [(pytest.approx(20e-6), 0.0)] * 3
-    text = to_text(render_answer(found, saved=Path("out")))
-    assert text.count("not determined") == 3
-    options = ExportOptions(module=False, latched=(1, 1, 1))
-    lines = export_calibration(found, "linuxcnc", options=options)
+    assert answer(found).count("not determined") == 3
+    lines = export_calibration(found, "linuxcnc", options=LINES)
     assert lines["joints.ini"].count("BACKLASH = 0.020") == 3
 
 
-def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration):
+def test_a_session_that_states_no_compensation_is_asked_for_it(calibration):
     """A stated 0 is an answer; so is any other number. A joined session is named."""
     kind = "compensation not stated"
     assert calibration.assessment.of_kind(kind)
@@ -237,17 +228,19 @@ def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration
         record = replace(calibration.session, compensation=trims)
         assessed = assess(replace(calibration, assessment=None, session=record), **KNOWN)
         assert not assessed.of_kind(kind)
-    plans = [replace(plan, compensation=stated, path=Path("first/session.yaml"))]
-    plans.append(replace(plan, path=Path("second/session.yaml")))
-    sessions = [simulate_session(p, TRUTH, seed=6, sigma=NOISE).session for p in plans]
-    both = [replace(s, path=p.path) for s, p in zip(sessions, plans, strict=True)]
-    (asked,) = calibrate(both, "offsets", **UNJUDGED).assessment.of_kind(kind)
+    both = replace(calibration.session, parts=(calibration.session,) * 2)
+    setups = [
+        replace(s, name=f"{part}/{s.name}", compensation=trims)
+        for part, trims in (("first", stated), ("second", None))
+        for s in calibration.setups
+    ]
+    joint = replace(calibration, assessment=None, session=both, setups=tuple(setups))
+    (asked,) = assess(joint, **KNOWN).of_kind(kind)
     assert "second" in asked.text
     assert "first" not in asked.text
 
 
 def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
-    """The offsets were entered, the backlash was not."""
     entered = plan.with_controller(entered_offsets(calibration).round(6))
     session = simulate_session(entered, TRUTH, seed=4, sigma=NOISE).session
     validation = validate_calibration(
@@ -268,26 +261,24 @@ def test_a_small_backlash_stays_where_the_offsets_stay(plan):
     still = {**TRUTH, "x_slide.backlash": 3e-6, "y_slide.backlash": 0.0}
     plan = plan.with_gauge(replace(plan.gauge, sigma=1.5e-6))
     entered = plan.with_controller(np.array([0.8e-3, -0.5e-3, 0.0]))
-    found = calibrate(simulate_session(entered, still, seed=3, sigma=1.5e-6).session, **UNJUDGED)
+    found = measure(entered, None, truth=still, sigma=1.5e-6)
     judged = found.assessment
     (x, *_) = judged.backlash
     assert x.identified > expanded_uncertainty(found, x)
     assert (judged.keeps_offsets, x.enter) == (True, 0.0)
     assert "acklash" not in judged.decision.headline
-    assert re.search("x_slide +0.000 +unchanged ", to_text(render_answer(found, saved=Path("out"))))
+    assert re.search("x_slide +0.000 +unchanged ", answer(found))
 
 
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):
     entered = plan.with_controller(np.array([0.8e-3, -0.5e-3, 0.0]))
-    session = simulate_session(entered, TRUTH, seed=5, sigma=NOISE).session
-    found = calibrate(session, "offsets", **UNJUDGED)
+    found = measure(entered, seed=5)
     judged = found.assessment
     assert judged.keeps_offsets
     assert any(e.change for e in judged.backlash)
     assert "Enter the backlash." in judged.decision.headline
     assert judged.tool.entered < judged.tool.without_backlash == judged.tool.now
-    options = ExportOptions(module=False, latched=(1, 1, 1))
-    lines = export_calibration(found, "linuxcnc", anyway=True, options=options)["joints.ini"]
+    lines = export_calibration(found, "linuxcnc", anyway=True, options=LINES)["joints.ini"]
     assert lines.count("BACKLASH = ") == 2
 
 

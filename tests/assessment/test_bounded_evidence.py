@@ -30,7 +30,6 @@ def test_the_share_of_one_variable_is_that_of_its_distribution():
 
 @pytest.mark.parametrize("size", [2, 3, 6])
 def test_the_share_of_several_variables_is_that_of_draws(size):
-    """Shares of independent variables are multiplied."""
     rng = np.random.default_rng(size)
     root = rng.normal(size=(size, size + 1))
     covariance, mean = root @ root.T, rng.normal(size=size) + 0.5
@@ -74,7 +73,6 @@ def test_the_evidence_of_one_parameter_is_its_integral(true, scale, reference):
 
 @pytest.fixture(scope="module")
 def backlash():
-    """Readings from both sides on a machine with backlash of two drives."""
     errors = {"y_slide.backlash": 30e-6, "x_slide.backlash": 10e-6, "x_slide.offset": 0.1e-3}
     return simulate_session(effect_plan("backlash"), errors, seed=4).session
 
@@ -113,7 +111,6 @@ def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash):
 
 
 def _zero_means(model):
-    """Projection on the gauge zeros; each is the mean of its entries."""
     incidence = model.problem.zero_incidence
     dense = incidence.toarray() if hasattr(incidence, "toarray") else np.asarray(incidence)
     return dense / dense.sum(axis=0) @ dense.T

@@ -33,7 +33,6 @@ def space(orthoglide):
 
 
 def with_mounting(plan, mounting):
-    """The plan with another mounting uncertainty of its gauges."""
     setups = {
         name: replace(s, sensor=replace(s.sensor, mounting=mounting))
         for name, s in plan.setups.items()
@@ -42,7 +41,6 @@ def with_mounting(plan, mounting):
 
 
 def once(plan):
-    """Each posture of a setup read once."""
     first = {(r.setup, r.posture): r for r in reversed(plan.readings)}
     return replace(plan, readings=tuple(r for r in plan.readings if r in first.values()))
 
@@ -68,10 +66,7 @@ def bound(plan, space, *, sigma, free):
 
 @pytest.mark.parametrize(
     ("name", "sigma", "joints", "complete"),
-    [
-        ("raw-cycles", 5e-6, (63.0, 12.2), 14.8),
-        ("lines", 10e-6, (58.0, 10.1), 12.9),
-    ],
+    [("raw-cycles", 5e-6, (63.0, 12.2), 14.8), ("lines", 10e-6, (58.0, 10.1), 12.9)],
 )
 def test_bounds_are_those_of_the_design(space, name, sigma, joints, complete):
     plan = once(plan_of(name))

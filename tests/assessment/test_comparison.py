@@ -8,20 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import SOUND, calibrated, plan_of, session_of
+from calibrated import SOUND, plan_of, session_of
 from gauges import with_gauges, with_scatter
 
 from orthocal import calibrate, draw_errors, join_sessions, simulate_session, summarize
 from orthocal.assessment.comparison import compare_models, find_known_noises
-from orthocal.assessment.recommendation import (
-    STRONG,
-    Recommendation,
-    recommend_model,
-)
+from orthocal.assessment.recommendation import STRONG, Recommendation, recommend_model
 from orthocal.assessment.scores import score_model
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.comparison import describe_recommendation
-from orthocal.errors import ParameterError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
@@ -33,6 +28,12 @@ from orthocal.session.session import Gauge
 from orthocal.statistics.zeros import project_out_zeros
 
 QUICK = SolverOptions("variable-projection")
+
+
+def compare(session, *models, **options):
+    return compare_models(session, models=models, options=QUICK, **options)
+
+
 EXAMPLES = {"table1": "table1/experiment-2", "cycles": "raw-cycles"}
 
 
@@ -48,7 +49,6 @@ def cycles():
 
 
 def test_the_complete_model_is_recommended_for_table_1(table1):
-    """Residuals of offsets are ten times the noise of the dial."""
     assert table1.recommendation.model == "full"
     assert table1.best is table1["full"]
     assert [r.model for r in table1] == ["offsets", "lengths", "full"]
@@ -68,43 +68,47 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     assert found.of_kind("repetition unknown")  # no reading is redundant
 
 
-def test_models_are_compared_with_the_recommended_one_only():
+def test_models_are_compared_with_the_recommended_one_only(table1):
     """Without the complete model, which is recommended, the largest is no reference."""
     session = session_of("table1/experiment-2")
-    compared = compare_models(session, models=["offsets", "lengths"], options=QUICK)
+    compared = compare(session, "offsets", "lengths", judgement=table1.judgement)
     assert compared.recommendation.model == "full"
     assert compared.best.model == "lengths"
     assert compared.assessment.of_kind("recommended")
     assert not compared.assessment.of_kind("not recommended")
 
 
-RECOMMENDED = {
-    "table1": ("full", -116.95),
-    "cycles": ("offsets", 11.8),
-}
+RECOMMENDED = {"table1": ("full", -116.95), "cycles": ("offsets", 11.8)}
 """Recommended model, and ln evidence of offsets against the complete model at the stated noise."""
 
 
 @pytest.mark.parametrize("name", RECOMMENDED)
-def test_compare_and_calibrate_recommend_the_same_model(name, request):
+def test_compare_and_calibrate_state_the_same_model_and_tool_error(name, request):
     compared = request.getfixturevalue(name)
     model, evidence = RECOMMENDED[name]
     assert compared.recommendation.model == model
     assert compared.recommendation.log_evidence_of("offsets") == pytest.approx(evidence, abs=0.05)
     session, judgement = session_of(EXAMPLES[name]), compared.judgement
-    calibration = calibrate(session, solver="variable-projection", judgement=judgement)
-    (first,) = compared.assessment.of_kind("recommended")
-    (second,) = calibration.assessment.of_kind("recommended")
-    assert model in first.text
-    assert model in second.text
+    calibration = calibrate(session, model, solver="variable-projection", judgement=judgement)
+    both = compared.assessment, calibration.assessment
+    for assessment in both:
+        (finding,) = assessment.of_kind("recommended")
+        assert model in finding.text
+    first, second = (assessment.of_kind("tool error") for assessment in both)
+    assert [f.text for f in first] == [f.text for f in second]
+    assert both[0].tool.box == both[1].tool.box
+    row = next(r for r in summarize(compared).splitlines() if r.split()[:1] == [model])
+    assert tool_mm(both[1].tool.entered) in row
+    for figure in ("now", "entered", "compensated"):
+        values = [getattr(assessment.tool, figure) for assessment in both]
+        assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
 def test_doubtful_readings_get_no_recommendation(raw_cycles):
-    """Neither a model nor a tool error, in text and JSON; `calibrate` recommends none, too."""
     session = raw_cycles.select([r for r in raw_cycles.readings if r.cycle <= 2])
     sides = [-1.0 if r.setup == "yx" else 1.0 for r in session.readings]
     session = session.with_values(session.values * sides)
-    compared = compare_models(session, models=["offsets"], options=QUICK)
+    compared = compare(session, "offsets")
     assessed, judgement = compared.assessment, compared.judgement
     assert judgement.verdict == "review"
     assert (compared.recommendation, compared.effects, assessed.tool) == (None, None, None)
@@ -124,9 +128,7 @@ def test_doubtful_readings_get_no_recommendation(raw_cycles):
 
 def test_residuals_of_offsets_repeat(experiment_2):
     again = session_of("table1/experiment-3")
-    found = compare_models(
-        experiment_2, models=["offsets"], repeat=again, options=QUICK, judgement=SOUND
-    )
+    found = compare(experiment_2, "offsets", repeat=again, judgement=SOUND)
     assert found.best is found["offsets"]  # the largest compared model
     assert found.repetition.repeats
     assert found.repetition.correlation == pytest.approx(0.9937, abs=5e-5)
@@ -134,20 +136,6 @@ def test_residuals_of_offsets_repeat(experiment_2):
     assert repeat.numbers["correlation"] == found.repetition.correlation
     (excess,) = found.assessment.of_kind("model error")
     assert excess.numbers["ratio"] == pytest.approx(9.8, abs=0.05)
-
-
-def test_the_tool_error_is_that_of_calibrate(cycles):
-    compared, calibration = cycles, calibrated("raw-cycles", cycles.best.model)
-    (first,) = compared.assessment.of_kind("tool error")
-    (second,) = calibration.assessment.of_kind("tool error")
-    assert first.text == second.text
-    assert compared.assessment.tool.box == calibration.assessment.tool.box
-    lines = summarize(compared).splitlines()
-    row = next(line for line in lines if line.split()[:1] == [cycles.best.model])
-    assert tool_mm(calibration.assessment.tool.entered) in row
-    for name in ("now", "entered", "compensated"):
-        values = [getattr(a.tool, name) for a in (compared.assessment, calibration.assessment)]
-        assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
 def test_the_scores_of_table_1_solved_by_hand(table1):
@@ -173,7 +161,7 @@ def test_the_scores_of_table_1_solved_by_hand(table1):
 def test_a_known_zero_takes_no_degree_of_freedom():
     """That of a ball bar. One reading of the dial fixes its zero."""
     session = session_of("linear_delta")
-    compared = compare_models(session, models=["offsets"])
+    compared = compare(session, "offsets", judgement=SOUND)
     (result,) = compared.results
     assert result.exact.dof == pytest.approx(len(session.readings) - 1 - result.effective)
 
@@ -182,7 +170,6 @@ COARSE, FINE = Gauge(20e-6), Gauge(2e-6)
 
 
 def scores_of(session, models):
-    """Results by model; the readings are not judged."""
     noises = find_known_noises(session)
     return {
         m: score_model(build_problem(session, model=m), noises=noises, options=QUICK)
@@ -191,7 +178,6 @@ def scores_of(session, models):
 
 
 def read_with_two_gauges(fine_setups, *, scale, seed):
-    """A drawn machine, read with a coarse gauge and a fine one."""
     session = session_of("raw-cycles")
     session = with_gauges(session, {"coarse": COARSE, "fine": FINE}, fine_setups)
     problem = build_problem(session, model="full", prior=True)
@@ -223,7 +209,7 @@ def test_criteria_do_not_depend_on_the_order_of_the_gauges():
     """The noise ratios of the models differ, but all compare readings in metres."""
     session = read_with_two_gauges(("xz", "yz"), scale=1.0, seed=7)
     swapped = replace(session, gauges=dict(reversed(session.gauges.items())))
-    models = ["offsets", "lengths", "full"]
+    models = ["offsets", "lengths"]
     first, second = scores_of(session, models), scores_of(swapped, models)
     for m in models:
         scores = first[m].exact, second[m].exact
@@ -327,18 +313,9 @@ def test_repeated_readings_are_not_counted_as_new_ones(cycles):
     assert cycles.assessment.decision.verdict == "enter"
 
 
-def test_undetermined_offsets_have_their_tolerances_as_prior(raw_cycles):
-    rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
-    session = replace(raw_cycles, readings=rows)
-    found = compare_models(session, models=["offsets"], options=QUICK, judgement=SOUND)
-    (result,) = found.results
-    assert (result.prior, result.calibration.redundancy) == (True, 0)
-    json.loads(found.to_json())
-
-
 def test_an_unstated_noise_is_unknown(experiment_2):
     session = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
-    found = compare_models(session, models=["offsets"], options=QUICK)
+    found = compare(session, "offsets")
     assert found.assessment.of_kind("noise from residuals")
     assert found.assessment.decision.exit_code == 0
     assert json.loads(found.to_json())["noises"] == [
@@ -347,41 +324,31 @@ def test_an_unstated_noise_is_unknown(experiment_2):
 
 
 def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
-    """Each setup of leg x is needed for one offset."""
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "zx", "xz"))
     session = replace(raw_cycles, readings=rows)
-    found = compare_models(session, models=["offsets"], options=QUICK, judgement=SOUND)
+    found = compare(session, "offsets", judgement=SOUND)
     assert np.isnan(found["offsets"].exact.prediction_error).any()
 
 
-def test_an_unknown_model_is_refused(experiment_2):
-    with pytest.raises(ParameterError, match="'all' is not a model"):
-        compare_models(experiment_2, models=["all"])
-
-
 def test_an_undetermined_offset_has_a_prior_in_all_models(raw_cycles):
-    """Without leg z its offset is undetermined."""
-    rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "xy"))
-    session, models = replace(raw_cycles, readings=rows), ["offsets", "lengths"]
-    found = compare_models(session, models=models, options=QUICK, judgement=SOUND)
+    rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
+    session = replace(raw_cycles, readings=rows)
+    found = compare(session, "offsets", "lengths", judgement=SOUND)
     assert found.undetermined == ()
+    assert found["offsets"].calibration.redundancy == 0
+    json.loads(found.to_json())
     assert [(r.model, r.prior) for r in found.results] == [("offsets", True), ("lengths", True)]
-
-
-def test_the_recommendation_is_first_and_models_without_redundancy_have_no_criteria(table1):
-    text = summarize(table1, details=True)
-    assert text.index("Recommended model") < text.index("Scores")
-    rows = text[text.index("Scores") : text.index("Estimates")].splitlines()
-    full = next(i for i, row in enumerate(rows) if row.strip().startswith("full"))
-    assert rows[full].split()[4:9] == ["–"] * 5
-    assert rows[full + 1].split()[1:6] == ["–"] * 5
 
 
 def test_the_summary_has_all_scores(table1):
     text = summarize(table1, details=True)
     assert text.startswith(summarize(table1).removesuffix(f"{MORE}\n"))
+    assert text.index("Recommended model") < text.index("Scores")
     for words in ("linear", "exact", "χ²", "AICc", "BIC", "CV", "tool", "ln evidence"):
         assert words in text
+    rows = text[text.index("Scores") : text.index("Estimates")].splitlines()
+    full = next(i for i, row in enumerate(rows) if row.strip().startswith("full"))
+    assert rows[full].split()[4:9] == rows[full + 1].split()[1:6] == ["–"] * 5  # no redundancy
     row = next(line for line in text.splitlines() if line.strip().startswith("x_slide.offset"))
     assert row.split() == ["x_slide.offset", "offsets", "-0.522", "-0.527", "3.030", "mm"]
     assert max(len(line) for line in text.splitlines()) <= 100
@@ -392,7 +359,7 @@ def test_the_summary_has_all_scores(table1):
 
 def test_readings_without_deviation_support_offsets_and_small_tolerances(raw_cycles):
     still = raw_cycles.with_values(np.zeros(len(raw_cycles.readings)))
-    found = compare_models(still, models=["offsets", "lengths"], options=QUICK)
+    found = compare(still, "offsets", "lengths")
     recommendation = recommend_model(still, ["offsets", "lengths"])
     assert recommendation.log_evidence_of("offsets") > STRONG
     assert recommendation.tolerance_scale < 0.2

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from calibrated import SOUND, UNJUDGED, session_of
 from effect_plans import ALL, FEW, FIRST, effect_plan
+from gauges import with_gauges
 from slack import Slack
 
 from orthocal import calibrate, simulate_session
@@ -30,13 +31,11 @@ ERRORS = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "y_slide.backlash": 5
 
 @pytest.fixture(scope="module")
 def session():
-    """A machine with backlash; its robot has the effects of its YAML."""
     return simulate_session(effect_plan("backlash", setups=FEW), ERRORS, seed=4).session
 
 
 @pytest.fixture(scope="module")
 def compared(session):
-    """Comparison of backlash with no effect."""
     return compare_effects(session.with_effects(["backlash"]))
 
 
@@ -87,16 +86,8 @@ def test_an_effect_that_cannot_act_does_not_change_the_evidence(session):
         replace(r, conditions=replace(r.conditions, time=FIRST + timedelta(seconds=k)))
         for k, r in enumerate(rows)
     ]
-    first, *_ = session.setups
-    plan = replace(
-        session,
-        readings=tuple(timed),
-        gauges={"dial": Gauge(2e-6), "digital": Gauge(1e-6)},
-        setups={
-            n: replace(s, gauge="dial" if n == first else "digital")
-            for n, s in session.setups.items()
-        },
-    )
+    gauges, (_, *others) = {"coarse": Gauge(2e-6), "fine": Gauge(1e-6)}, session.setups
+    plan = with_gauges(replace(session, readings=tuple(timed)), gauges, others)
     noisy = simulate_session(plan, ERRORS, seed=4).session
     values = noisy.values
     values[[r.cycle == 2 for r in noisy.readings]] += 6e-6  # above the stated noise
@@ -110,7 +101,6 @@ def test_an_effect_that_cannot_act_does_not_change_the_evidence(session):
 
 @pytest.fixture
 def slack():
-    """Readings of a machine with an effect of another package, whose YAML does not name it."""
     registry.register_effect(Slack)
     truth = {"y_leg.length": 40e-6, "x_slide.slack": 30e-6, "y_slide.slack": 50e-6}
     machine = effect_plan(keys="thermal: {}", setups=FEW).with_effects(["slack"])
@@ -142,7 +132,6 @@ def test_effects_are_compared_only_where_all_conditions_are_stated(session):
 
 
 def test_omitted_setups_are_predicted_by_conditioning(session):
-    """By the conditional mean of the joint normal distribution of all entries."""
     model = LinearModel(session)
     near = model.most_likely(session.values)
     about = model.linearise(near.theta, (), near.passive, keep_jacobian=True)
@@ -170,10 +159,7 @@ def test_the_option_is_named_unless_the_effect_is_stated(compared, stated, optio
 
 def test_a_comparison_of_models_recommends_the_effect(session):
     found = compare_models(
-        session.with_effects(["backlash"]),
-        models=["offsets"],
-        options=QUICK,
-        judgement=SOUND,
+        session.with_effects(["backlash"]), models=["offsets"], options=QUICK, judgement=SOUND
     )
     (note,) = found.assessment.of_kind("effects recommended")
     assert note.action == ""

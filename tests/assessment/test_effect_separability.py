@@ -26,7 +26,6 @@ def plan():
 
 
 def under(session, change):
-    """Session with other conditions, by a function of the row and its present ones."""
     readings, counts = [], Counter()
     for i, r in enumerate(session.readings):
         changed = replace(r, conditions=change(i, r.conditions))
@@ -127,7 +126,6 @@ def test_another_temperature_is_recommended_only_where_it_determines_more(plan, 
 
 
 def test_temperature_and_drift_that_grow_together_are_not_separated(plan):
-    """One posture of each setup, read repeatedly while it gets warmer."""
     kept = plan.select([r for r in plan.readings if r.posture == f"{r.setup[1]}_60"])
     rows = [replace(r, cycle=r.cycle + 2 * k) for k in range(3) for r in kept.readings]
     rows.sort(key=lambda r: r.setup)

@@ -43,10 +43,8 @@ def tool_error(plan, errors, offsets, space):
     """RMS tool error of a machine with offsets in its controller, aligned, [m]."""
     nominal = nominal_closure(plan.robot)
     drives = nominal.inverse(space.points)
-    moved = LoopClosure(plan.robot, fixed=errors).forward(drives - offsets) - nominal.forward(
-        drives
-    )
-    aligned = space.remove_motion(moved, space.points)
+    reached = LoopClosure(plan.robot, fixed=errors).forward(drives - offsets)
+    aligned = space.remove_motion(reached - nominal.forward(drives), space.points)
     return float(np.sqrt(space.weights @ (aligned**2).sum(axis=1)))
 
 
@@ -90,11 +88,9 @@ def test_the_tool_error_with_the_offsets_to_enter_is_the_predicted_one(quarter):
 
     The machines have legs of 250 mm and all errors at their tolerances.
     """
-    machines = DrawnMachines(quarter)
-    errors_by_offsets = {"chosen": [], "identified": [], "offsets": [], "predicted": []}
+    machines, found = DrawnMachines(quarter), []
     for seed in range(6):
-        drawn = machines.draw(np.random.default_rng(100 + seed))
-        errors = machines.by_name(drawn)
+        errors = machines.by_name(machines.draw(np.random.default_rng(100 + seed)))
         session = simulate_session(quarter, errors, seed=seed).session
         (full, _), (alone, _) = (
             identify(session, m, solver="variable-projection", find_scale=find_tolerance_scale)
@@ -102,21 +98,15 @@ def test_the_tool_error_with_the_offsets_to_enter_is_the_predicted_one(quarter):
         )
         tool = find_tool(full)
         entries = compute_entries(full, tool)
-        for name, offsets in (
-            ("chosen", [e.enter for e in entries]),
-            ("identified", [e.identified for e in entries]),
-            ("offsets", alone.offsets),
-        ):
-            errors_by_offsets[name].append(
-                tool_error(quarter, errors, np.array(offsets), tool.workspace)
-            )
+        ways = [e.enter for e in entries], [e.identified for e in entries], alone.offsets
+        achieved = [tool_error(quarter, errors, np.array(way), tool.workspace) for way in ways]
         predicted = summarise_tool(full, assess_placed(full, tool, entries)).entered
-        errors_by_offsets["predicted"].append(predicted)
-    rms = {n: np.sqrt(np.mean(np.square(values))) for n, values in errors_by_offsets.items()}
-    assert rms["chosen"] < 0.9 * rms["identified"]
-    assert rms["chosen"] < 0.9 * rms["offsets"]
+        found.append([*achieved, predicted])
+    chosen, identified, offsets, predicted = np.sqrt(np.mean(np.square(found), axis=0))
+    assert chosen < 0.9 * identified
+    assert chosen < 0.9 * offsets
     # a few combinations of errors decide about each machine
-    assert rms["chosen"] == pytest.approx(rms["predicted"], rel=0.3)
+    assert chosen == pytest.approx(predicted, rel=0.3)
 
 
 @pytest.fixture(scope="module")

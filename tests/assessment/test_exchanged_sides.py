@@ -7,16 +7,9 @@ from itertools import cycle, product
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from calibrated import UNJUDGED, plan_of
 
-from orthocal import (
-    calibrate,
-    check_session,
-    draw_errors,
-    join_sessions,
-    load_plan,
-    simulate_session,
-)
+from orthocal import calibrate, check_session, draw_errors, join_sessions, simulate_session
 from orthocal.assessment.exchanged_sides import find_exchanged_sides
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.compensation import JointTrim
@@ -28,7 +21,7 @@ BACKLASHES = {"x_slide.backlash": 40e-6, "y_slide.backlash": 55e-6, "z_slide.bac
 @pytest.fixture(scope="module")
 def sided():
     """Function from a seed to sound readings from both sides."""
-    plan = load_plan(ROOT / "examples/raw-cycles/plan.yaml").with_effects(["backlash"])
+    plan = plan_of("raw-cycles").with_effects(["backlash"])
     readings = tuple(
         replace(r, conditions=Conditions(approach=3 * side))
         for r in plan.readings
@@ -129,10 +122,10 @@ def test_exchanged_sides_are_found_where_no_posture_is_read_from_both(sided):
 
 def test_a_backlash_far_above_its_tolerance_is_reported(sided):
     session = sided(1)
-    assert not calibrate(session, "full").assessment.of_kind("above tolerances")
+    assert not calibrate(session, "full", **UNJUDGED).assessment.of_kind("above tolerances")
     errors = draw_errors(session.robot, ["*"], seed=1) | BACKLASHES | {"x_slide.backlash": 120e-6}
     worn = simulate_session(session, errors, seed=1).session
-    (finding,) = calibrate(worn, "full").assessment.of_kind("above tolerances")
+    (finding,) = calibrate(worn, "full", **UNJUDGED).assessment.of_kind("above tolerances")
     assert [p.parameter for p in finding.places] == ["x_slide.backlash"]
     assert finding.numbers["tolerance_mm"] == pytest.approx(0.04)  # of all Orthoglides
     assert finding.severity == "note"

@@ -11,15 +11,7 @@ from effect_plans import FIRST, effect_plan
 from models import TRUTH
 from planned import quick_plan
 
-from orthocal import (
-    calibrate,
-    check_session,
-    join_sessions,
-    load_session,
-    simulate_session,
-    write_session,
-)
-from orthocal.assessment.assess import assessment_of
+from orthocal import check_session, join_sessions, load_session, simulate_session, write_session
 from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.hypothesis import Rows
@@ -64,11 +56,12 @@ def test_the_largest_usual_difference_is_a_multiple_of_the_resolution(gauge, lar
     assert usual_difference(gauge) == pytest.approx(largest)
 
 
-DIFFERENCES = [((-0.03e-3,), 0), ((0.04e-3,), 1), ((0.05e-3,), 1), ((0.04e-3, -0.04e-3), 2)]
-"""Differences of the closing readings of the first setups, and how many setups are named."""
-
-
-def assert_named(assessment, session, differences, named):
+@pytest.mark.parametrize(
+    ("differences", "named"), [((-0.03e-3,), 0), ((0.04e-3,), 1), ((0.04e-3, -0.04e-3), 2)]
+)
+def test_closing_readings_that_differ_are_named(sound, differences, named):
+    session = with_closings(sound.with_values(sound.values + 0.11e-3), *differences)
+    assessment = check_session(session)
     assert assessment.decision.verdict == ("review" if named else "enter")
     findings = assessment.of_kind(KIND)
     assert len(findings) == bool(named)
@@ -76,19 +69,6 @@ def assert_named(assessment, session, differences, named):
         size = finding.numbers["largest_difference_mm"]
         assert size == pytest.approx(max(map(abs, differences)) * 1e3)
         assert {p.setup for p in finding.places} == set(list(session.setups)[:named])
-
-
-@pytest.mark.parametrize(("differences", "named"), DIFFERENCES)
-def test_closing_readings_that_differ_are_named(sound, differences, named):
-    session = with_closings(sound.with_values(sound.values + 0.11e-3), *differences)
-    assert_named(check_session(session), session, differences, named)
-
-
-def test_a_calibration_names_closing_readings_that_differ(sound):
-    differences, named = DIFFERENCES[-1]
-    session = with_closings(sound, *differences)
-    calibration = calibrate(session, solver="variable-projection")
-    assert_named(assessment_of(calibration), session, differences, named)
 
 
 def test_readings_of_which_most_closings_differ_scatter(sound):

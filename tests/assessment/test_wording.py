@@ -55,12 +55,8 @@ def test_names_keep_their_capitals():
         "  1. Setup yx, line 3: LinuxCNC must home.",
         "  2. Setup yx: read it again.",
     ]
-    assert [uncapitalised(t) for t in ("URDF of it", "Of it", "A-b", "")] == [
-        "URDF of it",
-        "of it",
-        "a-b",
-        "",
-    ]
+    texts = [uncapitalised(t) for t in ("URDF of it", "Of it", "A-b", "")]
+    assert texts == ["URDF of it", "of it", "a-b", ""]
 
 
 def test_directions_and_offsets():

@@ -11,13 +11,7 @@ from calibrated import plan_of, session_of
 from made_mistakes import make_mistakes, sound_session
 from scipy.stats import chi2
 
-from orthocal import (
-    check_session,
-    join_sessions,
-    load_session,
-    simulate_session,
-    write_session,
-)
+from orthocal import check_session, join_sessions, load_session, simulate_session, write_session
 from orthocal.assessment import judgement
 from orthocal.hypotheses.families.sessions import changes_between_sessions, detectable_changes
 from orthocal.hypotheses.hypothesis_set import explain_with_amounts
@@ -34,17 +28,8 @@ def plan():
     return plan_of("raw-cycles")
 
 
-def reverse(session, setup):
-    """The session with other signs of a setup's readings."""
-    values = [-r.value if r.setup == setup else r.value for r in session.readings]
-    return session.with_values(values)
-
-
-def test_a_reversed_setup_is_named():
-    found = check_session(reverse(session_of("raw-cycles"), "yx"))
-    assert found.decision.verdict == "review"
-    (finding,) = found.of_kind("reversed sign", "ambiguous")  # or single readings of it
-    assert {p.setup for p in finding.places} == {"yx"}
+def joined(days, *names):
+    return join_sessions([load_session(days / n) for n in names])
 
 
 def test_the_likeliest_line_of_rejected_readings_is_named():
@@ -63,7 +48,8 @@ def test_the_likeliest_line_of_rejected_readings_is_named():
 def test_one_difference_per_setup_does_not_determine_its_sign():
     session = session_of("table1/experiment-2")
     for setup in session.setups:
-        assert not check_session(reverse(session, setup)).of_kind("reversed sign")
+        values = [-r.value if r.setup == setup else r.value for r in session.readings]
+        assert not check_session(session.with_values(values)).of_kind("reversed sign")
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +65,13 @@ def days(plan, tmp_path_factory):
     return directory
 
 
-def test_a_displaced_slide_is_named_with_its_amount_and_session(days):
-    names = ("monday", "tuesday", "wednesday")
-    found = check_session(join_sessions([load_session(days / n) for n in names]))
+@pytest.fixture(scope="module")
+def all_days(days):
+    return check_session(joined(days, "monday", "tuesday", "wednesday"))
+
+
+def test_a_displaced_slide_is_named_with_its_amount_and_session(days, all_days):
+    found = all_days
     assert (found.decision.verdict, found.decision.exit_code) == ("review", 3)
     (finding,) = found.of_kind("machine changed")
     amount, std = (finding.numbers[f"x_slide.offset_{n}_mm"] for n in ("by", "std"))
@@ -93,11 +83,10 @@ def test_a_displaced_slide_is_named_with_its_amount_and_session(days):
     assert "wednesday" in finding.action
 
 
-def test_a_drive_that_moved_is_described_alike_after_two_sessions_and_more(days):
+def test_a_drive_that_moved_is_described_alike_after_two_sessions_and_more(days, all_days):
     """Only the second of two sessions states new offsets; the third one states the same."""
     texts, kinds = set(), []
-    for names in (("monday", "wednesday"), ("monday", "tuesday", "wednesday")):
-        found = check_session(join_sessions([load_session(days / n) for n in names]))
+    for found in (check_session(joined(days, "monday", "wednesday")), all_days):
         (finding,) = [f for f in found.findings if f.severity == "review"]
         kinds.append(finding.kind)
         texts.add(re.sub(r"\d+\.\d+", "#", f"{finding.text} {finding.action}"))
@@ -107,7 +96,7 @@ def test_a_drive_that_moved_is_described_alike_after_two_sessions_and_more(days)
 
 
 def test_without_a_change_the_detectable_size_is_stated(days):
-    found = check_session(join_sessions([load_session(days / n) for n in ("monday", "tuesday")]))
+    found = check_session(joined(days, "monday", "tuesday"))
     assert found.decision.verdict == "enter"
     (finding,) = found.of_kind("no change")
     assert 0.03 < finding.numbers["seen_from_mm"] < 0.12
@@ -116,7 +105,7 @@ def test_without_a_change_the_detectable_size_is_stated(days):
 
 
 def test_changes_beyond_the_travel_are_not_said_to_be_detectable(days, monkeypatch):
-    sessions = join_sessions([load_session(days / n) for n in ("monday", "tuesday")])
+    sessions = joined(days, "monday", "tuesday")
     changes = {"x_slide": 200.0, "y_slide": 0.4e-3, "z_slide": 0.3e-3}
     monkeypatch.setattr(judgement, "detectable_changes", lambda _: changes)
     (finding,) = check_session(sessions).of_kind("no change")
@@ -164,14 +153,6 @@ def test_a_tilted_slide_is_not_named_as_displaced(plan):
     assert found.explanation.parameters[0].startswith("x_")
 
 
-def test_a_wrong_reading_is_no_change(days):
-    joined = join_sessions([load_session(days / n) for n in ("monday", "tuesday")])
-    values = joined.values
-    values[70] += 0.3e-3
-    (found,) = find_anomalies(joined.with_values(values)).found
-    assert found.explanation.rows == (70,)
-
-
 def test_without_a_stated_noise_no_change_is_found(experiment_2):
     silent = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
     few = replace(silent, readings=silent.readings[:2])
@@ -181,7 +162,6 @@ def test_without_a_stated_noise_no_change_is_found(experiment_2):
 
 
 def estimate_change(session, drive):
-    """Change of a drive's offset between two sessions and its standard deviation, [m]."""
     model = LinearModel(session)
     search = _Search(session, model)
     family = next(f for f in changes_between_sessions(model) if not f.known)

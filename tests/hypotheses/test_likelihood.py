@@ -36,7 +36,6 @@ def covariances(jacobian, n=N):
 
 
 def log_normal(deviation, covariance):
-    """Logarithm of a normal density, by SciPy."""
     factor = Covariance.from_cholesky(np.linalg.cholesky(covariance))
     return multivariate_normal(np.zeros(len(covariance)), factor).logpdf(deviation)
 

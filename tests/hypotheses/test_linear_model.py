@@ -71,7 +71,6 @@ def test_a_machine_shift_changes_the_readings_of_its_sessions(model):
 
 @pytest.mark.parametrize("name", ["raw-cycles", "linear_delta"])
 def test_the_density_of_readings_is_that_of_their_contrasts(name):
-    """Against SciPy: each free gauge zero takes one dimension, a known one none."""
     model = LinearModel(session_of(name))
     o, at = model.problem.observations, model.at_reference(keep_jacobian=True)
     free = model.problem.zero_incidence[:, ~o.zero_known]

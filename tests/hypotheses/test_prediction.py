@@ -10,6 +10,7 @@ import plans
 import pytest
 import yaml
 from calibrated import plan_of, session_of
+from gauges import with_gauges
 
 from orthocal import draw_errors, load_plan, simulate_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
@@ -48,18 +49,12 @@ def part(session, count):
 
 def with_two_gauges(session, *, stated=True):
     fine = replace(session.gauge, sigma=1e-6 if stated else None, resolution=None)
-    gauges = {"coarse": session.gauge, "fine": fine}
-    setups = {
-        n: replace(s, gauge="fine" if i % 2 else "coarse")
-        for i, (n, s) in enumerate(session.setups.items())
-    }
-    return replace(session, gauges=gauges, setups=setups)
+    return with_gauges(session, {"coarse": session.gauge, "fine": fine}, list(session.setups)[1::2])
 
 
 def with_known_zero(session, name):
-    return replace(
-        session, setups=session.setups | {name: replace(session.setups[name], zero="known")}
-    )
+    known = replace(session.setups[name], zero="known")
+    return replace(session, setups=session.setups | {name: known})
 
 
 def condition(session, row):

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibrated import plan_of, session_of
-from commands import orthocal as run
+from gauges import with_gauges
 from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_session
 from planned import quick_plan
 
@@ -49,15 +49,14 @@ def sheet():
     return Sheet(session, np.random.default_rng(2))
 
 
-def reverse(session, row):
-    """The session with another sign of one reading."""
-    values = session.values.copy()
-    values[row] *= -1.0
-    return session.with_values(values)
+def both_orders(session, fine, coarse):
+    """The session with setups yx and zx read by a coarse gauge, in both orders of the gauges."""
+    names = [n for n in session.setups if n not in ("yx", "zx")]
+    gauges = {"fine": Gauge(fine), "coarse": Gauge(coarse)}
+    return [with_gauges(session, dict(g), names) for g in (gauges.items(), [*gauges.items()][::-1])]
 
 
 def anomalies(session):
-    """Findings that decide about the readings of a session."""
     return [f for f in check_session(session).findings if f.severity != "note"]
 
 
@@ -75,11 +74,7 @@ CORRECTED = [
 def test_an_edit_corrects_the_mistake(sheet, name):
     made = plain_mistakes()[name](sheet)
     rows = Rows(sheet.session.with_values(made.values))
-    families = [
-        *wrong_readings(rows),
-        *wrong_units_and_signs(rows),
-        *swapped_rows(rows),
-    ]
+    families = [*wrong_readings(rows), *wrong_units_and_signs(rows), *swapped_rows(rows)]
     best = min(
         float(np.abs(made.values + change - sheet.values).max())
         for family in families
@@ -89,15 +84,11 @@ def test_an_edit_corrects_the_mistake(sheet, name):
     assert best < 1e-9
 
 
-@pytest.fixture
-def reversed_row(cycles):
-    """Row of a reading of more than 0.4 mm."""
-    return next(i for i, r in enumerate(cycles.readings) if r.value > 0.4e-3 and r.cycle == 2)
-
-
-def test_a_reversed_reading_is_named_with_its_line_and_expected_value(cycles, reversed_row):
-    row = reversed_row
-    (found,) = anomalies(reverse(cycles, row))
+def test_a_reversed_reading_is_named_with_its_line_and_expected_value(cycles):
+    row = next(i for i, r in enumerate(cycles.readings) if r.value > 0.4e-3 and r.cycle == 2)
+    values = cycles.values
+    values[row] *= -1.0
+    (found,) = anomalies(cycles.with_values(values))
     assert (found.kind, found.severity) == ("reversed sign", "review")
     assert [p.line for p in found.places] == [cycles.readings[row].line]
     n = found.numbers
@@ -119,7 +110,6 @@ def test_a_factor_is_named_only_if_the_dial_can_show_the_corrected_readings(cycl
 
 
 def test_the_likeliest_of_further_wrong_readings_are_named(cycles):
-    """Of five wrong readings some are found; the action repeats one of the others."""
     _, *wrong = [rows[4] for rows in Rows(cycles).setups.values()][::-1]
     values = cycles.values
     values[wrong] += np.array([2.2, -0.9, 1.9, -2.7, 1.3]) * 1e-3
@@ -176,32 +166,13 @@ def test_a_reading_swapped_with_the_closing_one_is_named(seed, row, kind):
     assert f"{one.setup} {one.posture} and {other.setup} {other.posture}" in found.text
 
 
-def two_gauges(session, noises, setups):
-    """Session whose listed setups are read by a second gauge; noises are by name, the first first.
-
-    Args:
-        session: The session.
-        noises: Standard deviation of a reading of "dial" and "other", in the order of the gauges.
-        setups: Setups of "other".
-    """
-    return replace(
-        session,
-        gauges={name: Gauge(sigma, None, None) for name, sigma in noises.items()},
-        setups={
-            n: replace(s, gauge="other" if n in setups else "dial")
-            for n, s in session.setups.items()
-        },
-    )
-
-
-@pytest.mark.parametrize("first", ["dial", "other"])
-def test_corrected_steps_are_compared_with_the_noise_of_their_gauge(cycles, first):
+@pytest.mark.parametrize("order", [0, 1])
+def test_corrected_steps_are_compared_with_the_noise_of_their_gauge(cycles, order):
     """A gauge in thousandths of an inch, written as mm, beside a dial of a micrometre."""
     once = cycles.select([r for r in cycles.readings if r.cycle == 1])
-    noises = {"dial": 1e-6, "other": 13e-6}
-    session = two_gauges(once, {first: noises[first], **noises}, ("yx", "zx"))
     of_other = np.array([r.setup in ("yx", "zx") for r in once.readings])
     inches = np.round(once.values / 25.4e-6) * 1e-6
+    session = both_orders(once, 1e-6, 13e-6)[order]
     session = session.with_values(np.where(of_other, inches, once.values))
     tested = {
         (e.kind, e.factor)
@@ -217,21 +188,19 @@ def test_the_evidence_of_a_stuck_dial_does_not_depend_on_the_order_of_the_gauges
     rows = [i for i, r in enumerate(cycles.readings) if r.setup == "xz"]
     values = cycles.values
     values[rows[2]] = values[rows[1]]
-    noises, found = {"dial": 2e-6, "other": 0.1e-3}, []
-    for first in noises:
-        session = two_gauges(cycles, {first: noises[first], **noises}, ("yx", "zx"))
-        found += [
-            family.log_volume[h]
-            for family in displaced_gauges(Rows(session.with_values(values)))
-            for h in range(family.count)
-            if (family.explain(h).kind, family.explain(h).names) == ("stuck dial", ("xz",))
-        ]
+    found = [
+        family.log_volume[h]
+        for session in both_orders(cycles, 2e-6, 0.1e-3)
+        for family in displaced_gauges(Rows(session.with_values(values)))
+        for h in range(family.count)
+        if (family.explain(h).kind, family.explain(h).names) == ("stuck dial", ("xz",))
+    ]
     assert found == pytest.approx([-np.log(2e-6)] * 2)
 
 
 def test_errors_of_silent_rows_are_amounts_without_prior(cycles):
     """Amounts of a very wide prior; also beside another effect, of gauges with different noise."""
-    session = two_gauges(cycles, {"dial": 2e-6, "other": 0.1e-3}, ("yx", "zx"))
+    session, _ = both_orders(cycles, 2e-6, 0.1e-3)
     model, count = linear_model(session), len(session.readings)
     about = model.at_reference(keep_jacobian=False)
     silent = np.flatnonzero([r.setup in ("xz", "zx") for r in session.readings])
@@ -255,37 +224,17 @@ def test_errors_of_silent_rows_are_amounts_without_prior(cycles):
 
 @pytest.mark.parametrize("kind", ["outlier", "displaced gauge"])
 def test_the_evidence_of_an_amount_does_not_depend_on_the_order_of_the_gauges(cycles, kind):
-    """Amounts are compared with the noise of the gauge of their readings."""
-    noises, found = {"dial": 2e-6, "other": 0.1e-3}, []
+    found = []
     rows = [i for i, r in enumerate(cycles.readings) if r.setup == "xz"]
     values = cycles.values
     values[rows[4] if kind == "outlier" else rows[4:]] += 0.1e-3
-    for first in noises:
-        session = two_gauges(cycles, {first: noises[first], **noises}, ("yx", "zx"))
+    for session in both_orders(cycles, 2e-6, 0.1e-3):
         (anomaly,) = find_anomalies(session.with_values(values)).found
         assert anomaly.explanation.kind == kind
         if kind == "displaced gauge":
             assert anomaly.explanation.amount == pytest.approx(0.1e-3, abs=0.02e-3)
         found.append(anomaly.log_evidence)
     assert found[0] == pytest.approx(found[1], rel=1e-6)
-
-
-def test_a_sigma_in_a_wrong_unit_is_the_only_finding(cycles):
-    wrong = cycles.with_gauge(replace(cycles.gauge, sigma=1e-3, resolution=1e-5))
-    assert [found.kind for found in anomalies(wrong)] == ["sigma too large"]
-    unknown = cycles.with_gauge(replace(cycles.gauge, sigma=5e-3, resolution=None))
-    assert [found.kind for found in anomalies(unknown)] == ["sigma too large"]
-
-
-def test_the_command_prints_the_findings(root, tmp_path):
-    folder = root / "examples/raw-cycles"
-    (tmp_path / "session.yaml").write_text((folder / "session.yaml").read_text())
-    rows = (folder / "readings.csv").read_text().replace("x_max,2,0.44", "x_max,2,-0.44")
-    (tmp_path / "readings.csv").write_text(rows)
-    odd = run("check", tmp_path)
-    assert odd.returncode == 3
-    assert odd.stdout.startswith("Check these readings first.")
-    assert "Next: If so, write +0.44 instead of -0.44." in odd.stdout
 
 
 NAMED = [
@@ -298,7 +247,6 @@ NAMED = [
 
 @pytest.mark.slow
 def test_clear_mistakes_are_named():
-    """The benchmark prints the shares of all mistakes."""
     three = sound_session(plan_of("raw-cycles"), 3, entered=False)
     session = three.select([r for r in three.readings if r.cycle <= 2])
     made = {name: m for name, _, m in make_mistakes(session, 0, sizes=()) if name in NAMED}
@@ -321,18 +269,14 @@ def test_sound_sessions_have_no_anomaly(example, count):
         assert not anomalies(sound_session(plan_of(example), seed, entered=seed % 2 == 1)), seed
 
 
-HIDDEN = (3, (2, 11))
-"""Seed of a machine, and two rows of different setups."""
-
-
 def test_two_reversed_signs_that_hide_each_other_are_named():
     """No single sign is preferred to none; both together are the best set."""
-    session = sound_session(plan_of("workshop"), HIDDEN[0], entered=False)
+    session, rows = sound_session(plan_of("workshop"), 3, entered=False), [2, 11]
     values = session.values
-    values[list(HIDDEN[1])] *= -1.0
+    values[rows] *= -1.0
     found = find_anomalies(session.with_values(values))
     assert [a.explanation.kind for a in found.found] == ["reversed sign"] * 2
-    assert {i for a in found.found for i in a.explanation.rows} == set(HIDDEN[1])
+    assert {i for a in found.found for i in a.explanation.rows} == set(rows)
     assert not found.ambiguous
     assert found.explained
     assert found.rms_after < 0.5 * found.rms_before
@@ -402,9 +346,8 @@ def test_large_offsets_are_no_anomaly(tmp_path):
     plan = paper_plan(robot, Equipment()).with_tolerances({"*.offset_mm": 8.0})
     plan = plan.with_gauge(replace(plan.gauge, range=None))
     offsets = {"x_slide.offset": 6.8e-3, "y_slide.offset": -10.2e-3, "z_slide.offset": 8.4e-3}
-    for seed in (4,):
-        errors = draw_errors(plan.robot, machine_errors(robot), seed=seed) | offsets
-        session = simulate_session(plan, errors, seed=seed).session
-        assert not find_anomalies(session).found
-        sizes = LinearModel(session).most_likely(session.values).theta
-        assert np.abs(sizes).max() < LARGEST_ERROR
+    errors = draw_errors(plan.robot, machine_errors(robot), seed=4) | offsets
+    session = simulate_session(plan, errors, seed=4).session
+    assert not find_anomalies(session).found
+    sizes = LinearModel(session).most_likely(session.values).theta
+    assert np.abs(sizes).max() < LARGEST_ERROR

@@ -12,10 +12,19 @@ import numpy as np
 import pytest
 from calibrated import plan_of
 from commands import run_orthocal
+from conftest import marked_reports
 from effect_plans import effect_plan
+from gauges import with_gauges
 from made_mistakes import sound_session
 
-from orthocal import calibrate, draw_errors, load_calibration, simulate_session, write_session
+from orthocal import (
+    check_session,
+    draw_errors,
+    load_calibration,
+    load_session,
+    simulate_session,
+    write_session,
+)
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.compensation import JointTrim
 from orthocal.errors import SessionError
@@ -67,32 +76,11 @@ def measure_twice(plan, active, *, before=(0.0, 0.0, 0.0), changed=0.0, seed=1):
     return join_sessions(sessions)
 
 
-@pytest.mark.parametrize(
-    ("active", "kind", "drives"),
-    [
-        (ENTERED[[0, 2, 1]], "offsets interchanged", (1, 2)),
-        (np.add(ENTERED, (0.0, 0.8e-3, 0.0)), "offset of one drive", (1,)),
-    ],
-)
-def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
-    session = measure_twice(plan, active)
-    found = find_anomalies(session)
-    (anomaly,) = found.found
-    e = anomaly.explanation
-    assert (e.kind, e.sessions) == (kind, ("session-2",))
-    assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
-    if e.active:
-        assert np.array(e.active) == pytest.approx(active, abs=1e-9)
-    else:  # the change of the machine that has the same effect
-        assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
-    assert found.explained
-
-
 def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, tmp_path):
     """The stated offsets are right, so the new session alone is calibrated, as the action says."""
     parts = measure_twice(plan, ENTERED, changed=0.8e-3).parts
     paths = [write_session(part, tmp_path / f"day {k}").parent for k, part in enumerate(parts)]
-    found = calibrate(paths, "full").assessment
+    found = check_session(join_sessions([load_session(p) for p in paths]))
     (finding,) = found.of_kind("offset of one drive")
     assert found.decision.verdict == "review"
     assert "drive y_slide or its home switch moved by" in uncapitalised(finding.text)
@@ -101,7 +89,8 @@ def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, 
     (command,) = re.findall(r"`orthocal (calibrate .*)`", finding.action)
     action, path, option, out = shlex.split(command)
     assert (action, path, option) == ("calibrate", str(paths[1]), "--out")
-    assert run_orthocal(tmp_path, action, path, option, out).returncode == 0
+    with marked_reports():
+        assert run_orthocal(tmp_path, action, path, option, out).returncode == 0
     calibration = load_calibration(out)
     after = ENTERED + 10e-6 + [0.0, 0.8e-3, 0.0]
     for drive, true in zip(plan.robot.drives, after, strict=True):
@@ -143,27 +132,31 @@ WAYS = {
 
 
 def enter(way, drives):
-    """Offsets in the controller if some drives' are entered wrongly."""
     active = ENTERED.copy()
     active[list(drives)] = WAYS[way][1][list(drives)]
     return active
 
 
 @pytest.mark.parametrize(
-    ("way", "drives"),
+    ("before", "active", "kind", "drives"),
     [
-        ("sign of the change", (0, 2)),
-        ("change added", (0, 1, 2)),
+        (0.0 * BEFORE, ENTERED[[0, 2, 1]], "offsets interchanged", (1, 2)),
+        (0.0 * BEFORE, np.add(ENTERED, (0.0, 0.8e-3, 0.0)), "offset of one drive", (1,)),
+        (BEFORE, enter("sign of the change", (0, 2)), "offsets reversed", (0, 2)),
+        (BEFORE, enter("change added", (0, 1, 2)), "offsets entered twice", (0, 1, 2)),
     ],
 )
-def test_wrongly_entered_offsets_are_named_where_others_were_active(plan, way, drives):
-    active = enter(way, drives)
-    (anomaly,) = find_anomalies(measure_twice(plan, active, before=BEFORE)).found
+def test_offsets_that_are_not_as_stated_are_named(plan, before, active, kind, drives):
+    found = find_anomalies(measure_twice(plan, active, before=before))
+    (anomaly,) = found.found
     e = anomaly.explanation
-    assert (e.kind, e.sessions) == (WAYS[way][0], ("session-2",))
+    assert (e.kind, e.sessions, anomaly.between_sessions) == (kind, ("session-2",), True)
     assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
-    assert np.array(e.active) == pytest.approx(active, abs=1e-9)
-    assert anomaly.between_sessions
+    if e.active:
+        assert np.array(e.active) == pytest.approx(active, abs=1e-9)
+    else:  # the change of the machine that has the same effect
+        assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
+    assert found.explained
 
 
 @pytest.mark.parametrize("drives", [(1,), (0, 2), (0, 1, 2)])
@@ -175,10 +168,6 @@ def test_each_way_is_considered_for_some_drives_and_for_all(drives):
         active = enter(way, drives)
         (found,) = [(k, d) for k, d, c in considered if np.allclose(c, active, atol=1e-9)]
         assert found == (kind, drives)
-
-
-def test_sessions_with_the_stated_offsets_have_no_anomaly(plan):
-    assert find_anomalies(measure_twice(plan, ENTERED)).found == ()
 
 
 def test_wrong_offsets_are_listed_once():
@@ -198,7 +187,6 @@ def test_wrong_offsets_are_listed_once():
 
 @pytest.fixture(scope="module")
 def sided():
-    """Each posture is approached from both sides."""
     plan = effect_plan("backlash")
     return plan.with_gauge(replace(plan.gauge, sigma=5e-6, resolution=10e-6))
 
@@ -307,7 +295,6 @@ def test_the_readings_of_an_unfinished_session_are_searched(raw_cycles):
 
 
 def test_one_reversed_reading_of_three_is_no_reversed_setup(plan):
-    """The smaller change is more likely."""
     named = 0
     for seed in range(2):
         session = sound_session(plan, seed, entered=False)
@@ -323,22 +310,16 @@ def test_one_reversed_reading_of_three_is_no_reversed_setup(plan):
 
 def test_readings_are_compared_with_the_noise_of_their_gauge(raw_cycles):
     """A coarse gauge does not show a change of 0.1 mm; gauges of other setups are fine."""
-    session, names = raw_cycles, list(raw_cycles.setups)
-    coarse = replace(session.gauge, sigma=0.2e-3, resolution=0.1e-3)
-    fine = replace(session.gauge, sigma=2e-6, resolution=1e-6)
-    setups = {
-        n: replace(s, gauge="coarse" if n == names[0] else "fine")
-        for n, s in session.setups.items()
-    }
-    for first in ("coarse", "fine"):
-        gauges = {"coarse": coarse, "fine": fine}
-        ordered = {first: gauges[first], **gauges}
-        mixed = replace(session, gauges=ordered, setups=setups)
-        row = next(i for i, r in enumerate(mixed.readings) if r.setup == names[0])
-        values = mixed.values
-        values[row] += 0.1e-3
+    coarse = replace(raw_cycles.gauge, sigma=0.2e-3, resolution=0.1e-3)
+    fine = replace(raw_cycles.gauge, sigma=2e-6, resolution=1e-6)
+    _, *others = raw_cycles.setups
+    values = raw_cycles.values
+    values[0] += 0.1e-3
+    for gauges in ({"coarse": coarse, "fine": fine}, {"fine": fine, "coarse": coarse}):
+        mixed = with_gauges(raw_cycles, gauges, others)
+        assert mixed.readings[0].setup not in others
         found = find_anomalies(mixed.with_values(values)).found
-        assert not any(row in a.explanation.rows for a in found)
+        assert not any(0 in a.explanation.rows for a in found)
 
 
 @pytest.fixture(scope="module")
@@ -378,19 +359,21 @@ def test_a_gauge_without_readings_is_not_that_of_the_readings(days):
     assert LinearModel(session).sigma == LinearModel(days[0]).sigma
 
 
+def read_often(session, count, rng):
+    """The first setup of a session, read `count` times with noise of 10 µm."""
+    setup = session.readings[0].setup
+    once = [r for r in session.readings if r.setup == setup and r.cycle == 1]
+    readings = [replace(r, cycle=c + 1) for c in range(count // len(once)) for r in once]
+    large = session.select(readings)
+    return large.with_values(large.values + 1e-5 * rng.normal(size=count))
+
+
 def test_a_dial_that_is_stuck_for_many_readings_is_one_finding(raw_cycles):
     """The first reading of the run counts, and all others have no information."""
-    name = next(iter(raw_cycles.setups))
-    own = [r for r in raw_cycles.readings if r.setup == name and r.cycle == 1]
-    rng = np.random.default_rng(0)
-    readings = [
-        replace(r, cycle=c + 1, value=r.value + 1e-5 * float(rng.normal()))
-        for c in range(60 // len(own))
-        for r in own
-    ]
-    values = np.array([r.value for r in readings])
+    session = read_often(raw_cycles, 60, np.random.default_rng(0))
+    values = session.values
     values[10:50] = values[10]
-    found = find_anomalies(raw_cycles.select(readings).with_values(values)).found
+    found = find_anomalies(session.with_values(values)).found
     assert [(a.explanation.kind, a.explanation.rows) for a in found] == [
         ("stuck dial", tuple(range(10, 50)))
     ]
@@ -399,26 +382,16 @@ def test_a_dial_that_is_stuck_for_many_readings_is_one_finding(raw_cycles):
 @pytest.mark.slow
 def test_memory_is_linear_in_the_readings(raw_cycles):
     """All families consider all readings of a setup. The first search fills caches."""
-    session = raw_cycles
-    name = next(iter(session.setups))
-    own = [r for r in session.readings if r.setup == name and r.cycle == 1]
-    rng = np.random.default_rng(0)
-    peaks = []
-    for count in (60, 90, 180):
-        readings = [
-            replace(r, cycle=c + 1, value=r.value + 1e-5 * float(rng.normal()))
-            for c in range(count // len(own))
-            for r in own
-        ]
-        values = np.array([r.value for r in readings])
+    rng, peaks = np.random.default_rng(0), []
+    find_anomalies(read_often(raw_cycles, 60, rng))
+    for count in (90, 180):
+        large = read_often(raw_cycles, count, rng)
+        values = large.values
         values[count // 3] += 1e-3
-        large = session.select(readings).with_values(values)
-        if count > 60:
-            tracemalloc.start()
-        found = find_anomalies(large)
-        if count > 60:
-            peaks.append(tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
+        tracemalloc.start()
+        found = find_anomalies(large.with_values(values))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
         assert [a.explanation.rows for a in found.found] == [(count // 3,)]
     assert peaks[1] < 2.5 * peaks[0]
 
@@ -480,7 +453,6 @@ def test_the_order_in_which_sessions_are_joined_does_not_matter(plan):
 
 
 def at(session, day):
-    """The session with the time of a day."""
     conditions = Conditions(time=datetime(2026, 1, day))
     return session.select([replace(r, conditions=conditions) for r in session.readings])
 

@@ -16,11 +16,8 @@ from scipy.integrate import quad
 from slack import Slack
 from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
-from orthocal import (
-    Choice,
-    check_session,
-    simulate_session,
-)
+from orthocal import Choice, simulate_session
+from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.errors import RobotError
@@ -41,12 +38,10 @@ GEOMETRY = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "z_slide.offset": -
 
 @pytest.fixture(scope="module")
 def plan():
-    """Each posture is approached from both sides while it gets warmer."""
     return effect_plan(setups=FEW)
 
 
 def read(plan, effect, errors):
-    """Readings of a machine with an effect, which the model lacks."""
     machine = plan.with_effects([effect] if effect else [])
     return simulate_session(machine, GEOMETRY | errors, seed=4).session.with_effects([])
 
@@ -57,7 +52,8 @@ def with_backlash(plan):
 
 
 def test_backlash_is_named_with_its_drive_amount_and_option(with_backlash):
-    (found,) = find_anomalies(with_backlash).found
+    judgement = judge_session(with_backlash)
+    (found,) = judgement.anomalies
     e = found.explanation
     assert (e.kind, found.ambiguous) == ("backlash", False)
     amounts = dict(zip(e.parameters, zip(e.amounts, e.stds, strict=True), strict=True))
@@ -65,8 +61,7 @@ def test_backlash_is_named_with_its_drive_amount_and_option(with_backlash):
     assert value == pytest.approx(50e-6, abs=3.0 * std)
     assert std < 10e-6
     assert amounts["x_slide.backlash"][0] < 10e-6
-    assessment = check_session(with_backlash)
-    (finding,) = [f for f in assessment.findings if f.severity != "note"]
+    (finding,) = [f for f in judgement.findings if f.severity != "note"]
     assert (finding.kind, finding.severity) == ("backlash", "review")
     assert [p.parameter for p in finding.places] == ["y_slide.backlash"]
     assert "--effects backlash" in finding.action
@@ -110,11 +105,9 @@ def test_thermal_expansion_is_named_without_deviation_from_its_stated_size():
 
 
 def test_effects_of_a_thousandth_of_their_tolerance_are_not_named(plan):
-    effect = "backlash"
-    machine = plan.with_effects([effect])
-    names = [n for n in machine.robot.parameters.of_effects]
-    errors = {n: 1e-3 * machine.robot.parameters[n].prior_std for n in names}
-    assert find_anomalies(read(plan, effect, errors)).found == ()
+    parameters = plan.with_effects(["backlash"]).robot.parameters
+    errors = {n: 1e-3 * parameters[n].prior_std for n in parameters.of_effects}
+    assert find_anomalies(read(plan, "backlash", errors)).found == ()
 
 
 def test_an_approach_from_one_side_shows_no_backlash(plan):
@@ -127,7 +120,6 @@ def test_an_approach_from_one_side_shows_no_backlash(plan):
 
 @pytest.fixture
 def slack():
-    """Plan of a machine with an effect of another package."""
     registry.register_effect(Slack)
     yield effect_plan("slack", keys="slack: {lead_mm: 10}", setups=FEW)
     registry.unregister_effect("slack")
@@ -144,13 +136,14 @@ LOOSE = {
 
 def test_an_effect_of_another_package_is_named_by_its_description(slack):
     session = read(slack, "slack", LOOSE)
-    (found,) = find_anomalies(session).found
+    judgement = judge_session(session)
+    (found,) = judgement.anomalies
     e = found.explanation
     assert (e.kind, e.effect, found.ambiguous) == ("other effect", "slack", False)
     for name, amount, std in zip(e.parameters, e.amounts, e.stds, strict=True):
         assert amount == pytest.approx(LOOSE.get(name, 0.0), abs=3.0 * std)
     assert dict(zip(e.parameters, e.stds, strict=True))["x_slide.slack"] < 4e-6
-    (finding,) = [f for f in check_session(session).findings if f.severity != "note"]
+    (finding,) = [f for f in judgement.findings if f.severity != "note"]
     assert finding.kind == "other effect"
     assert Slack.describe(None) in finding.text
     assert {"x_slide.slack", "y_slide.slack"} <= {p.parameter for p in finding.places}
@@ -183,7 +176,7 @@ def test_an_effect_that_does_not_fit_the_robot_is_not_tested(slack):
 
 def test_a_reversed_sign_is_not_named_as_an_effect(plan):
     session = read(plan, None, {})
-    values = session.values.copy()
+    values = session.values
     row = int(np.abs(values).argmax())
     values[row] *= -1.0
     (found,) = find_anomalies(session.with_values(values)).found
