@@ -463,7 +463,7 @@ KEPT = re.compile(r"Recorded: line \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.
 def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     """Killed at all steps of writing, while readings, corrections and repeats come in."""
     monkeypatch.setenv("COLUMNS", "100")
-    folder = make_plan(tmp_path / "session", cycles=60)  # more than are read before all ends
+    folder = make_plan(tmp_path / "session", cycles=12)  # more than are read before all ends
     monkeypatch.setattr(recording.Dialogue, "_is_doubtful", lambda *_, **__: False)
     monkeypatch.setattr(recording.Dialogue, "_judge", lambda *_, **__: False)
     robot = load_plan(folder).robot
