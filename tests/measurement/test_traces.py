@@ -71,6 +71,21 @@ def machine(plan):
     return errors, read
 
 
+@pytest.fixture(scope="module")
+def there_and_back(machine):
+    """Trace of a circle with 3,000 samples."""
+    points = circle("xy", 3000)
+    return Trace(points, machine[1](points, 0))
+
+
+def write_trace(trace, folder):
+    """The trace as a file."""
+    rows = np.column_stack([trace.points, trace.values]) * 1e3
+    head = "x_mm,y_mm,z_mm,reading_mm"
+    np.savetxt(folder / "xy.csv", rows, delimiter=",", header=head, comments="", fmt="%.7f")
+    return folder / "xy.csv"
+
+
 def solve(session, sigma):
     problem = build_problem(session, model="full", prior_stds={"*.offset": 0.5e-3})
     values = problem.observations.values(session.values)
@@ -133,10 +148,8 @@ def test_noise_of_bins_is_that_of_their_means(plan, machine):
     assert np.abs(missed).max() < 4.0 * binned.std
 
 
-def test_a_trace_comes_from_a_file_and_goes_into_a_session(plan, machine, tmp_path):
-    _, read = machine
-    points = circle("xy", 3000)
-    values = read(points, 0)
+def test_a_trace_comes_from_a_file_and_goes_into_a_session(plan, there_and_back, tmp_path):
+    points, values = there_and_back.points, there_and_back.values
     rows = np.column_stack([np.arange(3000) / 1e3, points * 1e3, values * 1e3])
     head = "time_s,x_mm,y_mm,z_mm,reading_mm"
     np.savetxt(tmp_path / "xy.csv", rows, delimiter=",", header=head, comments="", fmt="%.7f")
@@ -149,13 +162,9 @@ def test_a_trace_comes_from_a_file_and_goes_into_a_session(plan, machine, tmp_pa
     assert all(isinstance(r.conditions, Conditions) for r in again.readings)
 
 
-def test_the_command_writes_a_session(plan, machine, tmp_path):
-    _, read = machine
-    points = circle("xy", 3000)
-    rows = np.column_stack([points, read(points, 0)]) * 1e3
-    head = "x_mm,y_mm,z_mm,reading_mm"
-    np.savetxt(tmp_path / "xy.csv", rows, delimiter=",", header=head, comments="", fmt="%.7f")
-    words = ("trace", plan.path, f"xy={tmp_path / 'xy.csv'}", "--out", tmp_path / "s")
+def test_the_command_writes_a_session(plan, there_and_back, tmp_path):
+    file = write_trace(there_and_back, tmp_path)
+    words = ("trace", plan.path, f"xy={file}", "--out", tmp_path / "s")
     done = orthocal(*words)
     assert done.returncode == 0
     assert "3000 samples" in done.stderr
@@ -166,25 +175,22 @@ def test_the_command_writes_a_session(plan, machine, tmp_path):
     assert {r.setup for r in session.readings} == {"xy"}
 
 
-def test_bins_with_few_samples_are_counted(plan, machine, tmp_path):
+def test_bins_with_few_samples_are_counted(plan, there_and_back, tmp_path):
     """Two stretches of the path have one sample in ten, as after a lost connection."""
-    _, read = machine
-    points = circle("xy", 3000)
     sample = np.arange(3000)
     lost = ((sample > 500) & (sample < 600)) | ((sample > 2000) & (sample < 2050))
-    points = points[~lost | (sample % 10 == 0)]
-    binned = bin_trace(Trace(points, read(points, 0)))
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    kept = ~lost | (sample % 10 == 0)
+    trace = Trace(there_and_back.points[kept], there_and_back.values[kept])
+    binned = bin_trace(trace)
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(trace.points, axis=0), axis=1)))
     half = along[-1] / 2
     edges = np.append(np.linspace(0.0, half, 80)[:-1], np.linspace(half, 2.0 * half, 80))
     counts = np.histogram(along, edges)[0]
     assert binned.unused_bins == (counts < 8).sum() == 6
     assert binned.unused_samples == counts[counts < 8].sum()
     assert len(binned.values) + binned.unused_bins == len(counts)
-    rows = np.column_stack([points, read(points, 0)]) * 1e3
-    head = "x_mm,y_mm,z_mm,reading_mm"
-    np.savetxt(tmp_path / "xy.csv", rows, delimiter=",", header=head, comments="", fmt="%.7f")
-    done = orthocal("trace", plan.path, f"xy={tmp_path / 'xy.csv'}", "--out", tmp_path / "s")
+    file = write_trace(trace, tmp_path)
+    done = orthocal("trace", plan.path, f"xy={file}", "--out", tmp_path / "s")
     sentence = (
         f"{binned.unused_bins} of {len(counts)} bins ({binned.unused_samples} samples) were not "
         "used: a bin needs 8 samples at different positions"
