@@ -11,6 +11,7 @@ import pytest
 from calibrated import UNJUDGED
 from closed_form import inverse
 from commands import run_orthocal
+from conftest import marked_pictures
 from effect_plans import write_plan
 
 from orthocal import (
@@ -49,6 +50,12 @@ COMP_FILE = trims.comp
 COMP_FILE_TYPE = 1
 BACKLASH = 0.2
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_pictures():
+    with marked_pictures():
+        yield
 
 
 @pytest.fixture
