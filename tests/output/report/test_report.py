@@ -155,6 +155,7 @@ def test_stated_tolerances_are_those_before_their_scale(root):
     scaled = calibrate(
         root / "examples/table1/experiment-2",
         Choice(model="lengths", tolerances={"x_leg.length_m": 0.4e-3}),
+        **QUICK,
     )
     assert scaled.tolerance_scale.factor == pytest.approx(2.83, abs=0.005)
     rows = Reader(_provenance(scaled)).rows
@@ -227,7 +228,7 @@ def test_texts_from_files_are_escaped(raw_cycles):
         },
         readings=tuple(replace(r, posture=f"{r.posture}{EVIL}") for r in renamed.readings),
     )
-    found = calibrate(session, **QUICK)
+    found = calibrate(session, **UNJUDGED)
     with marked_plots():  # names in plots: `test_names_from_files_are_shown_unchanged`
         read = Reader(build_report(found))
     assert "script" not in read.tags
