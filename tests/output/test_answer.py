@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import plans
@@ -24,6 +25,7 @@ from orthocal import (
 )
 from orthocal.assessment.controller_entries import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_tool_error
+from orthocal.output.report import page
 from orthocal.output.report.page import build_report
 from orthocal.output.text.answer import (
     LISTED,
@@ -266,30 +268,30 @@ def test_details_and_all_hold_the_answer_and_the_rest(answers):
     for name in ("table1/experiment-2", "turned"):
         calibration = answers[name]
         answer = to_text(render_answer(calibration))
-        details = summarize(calibration, details=True)
+        short, details = summarize(calibration), summarize(calibration, details=True)
         assert details.startswith(answer)
         for title in (
             *("Method", "Parameters", "Readings", "Residuals", "Tool error"),
             *("Findings", name_values(calibration), "For research"),
         ):
             assert f"\n{title}\n" in details
-            assert f"\n{title}\n" not in summarize(calibration)
+            assert f"\n{title}\n" not in short
         assert summarize(calibration, all_rows=True).startswith(answer)
         assert f"Solver: {calibration.solver.name}, {calibration.solver.status}" in details
     assert len(summarize(answers["full"], all_rows=True).splitlines()) > 162
 
 
 def test_notebook_and_report_show_the_same_answer(answers):
-    with marked_plots():
+    with marked_plots(), patch.object(page, "_scene", lambda _: ""):
         report = build_report(answers["turned"])
     for name in ("table1/experiment-2", "turned"):
         found, notebook = answers[name].assessment, answers[name]._repr_html_()
-        for page in (notebook, report) if name == "turned" else (notebook,):
-            assert found.decision.headline in page
+        for shown in (notebook, report) if name == "turned" else (notebook,):
+            assert found.decision.headline in shown
             for finding in found.findings:
                 stated = found.decision.verdict == "enter" and finding.kind == "tool error"
                 if finding.severity != "note" or stated:
-                    assert finding.text.replace("'", "&#x27;") in page
+                    assert finding.text.replace("'", "&#x27;") in shown
         assert "studentised" not in notebook
     headline = answers["turned"].assessment.decision.headline
     assert report.index(headline) < report.index("<td>x_slide</td>")
