@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from browser import open_browser, visit
 from commands import run_orthocal
+from conftest import marked_pictures
 from gauges import with_gauges
 from lxml import etree
 from machines import place
@@ -242,7 +243,8 @@ def test_front_page_states_what_the_controller_compensates(small):
     trims = (JointTrim(table=table), JointTrim(0.05 * MM), JointTrim())
 
     def front(session):
-        (page,) = (text for name, text in sheet_files(session).items() if name.endswith(".html"))
+        with marked_pictures():
+            (page,) = (t for name, t in sheet_files(session).items() if name.endswith(".html"))
         return " ".join(words(etree.HTML(page)).split())
 
     stated = front(replace(small, compensation=trims))
