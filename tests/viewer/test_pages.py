@@ -7,6 +7,7 @@ import pytest
 from browser import SIZES, SMALL, open_browser, require_browser, visit
 from calibrated import (
     EXPERIMENT_2,
+    UNJUDGED,
     calibrated,
     plan_of,
     rename_setups,
@@ -309,7 +310,7 @@ def test_report_is_as_wide_as_its_window(report):
 def test_no_text_of_a_plot_is_cut_off(browser, tmp_path):
     """Browsers may draw text wider than matplotlib does, here the names of 40 parameters."""
     path = tmp_path / "plot.html"
-    path.write_text(plot_correlations(calibrated("workshop", "full")), encoding="utf-8")
+    path.write_text(plot_correlations(calibrated("workshop", "full", **UNJUDGED)), encoding="utf-8")
     with visit(browser, path.as_uri()) as found:
         texts = found.page.evaluate(
             """() => {
