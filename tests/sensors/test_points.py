@@ -139,12 +139,12 @@ def test_check_names_a_mistyped_point_alone(tmp_path, point, axis, factor, kind)
 
 @pytest.mark.parametrize("mistype", [[1.0, 1.0, -1.0], [1.01, 1.0, 1.0], [1.05, 1.0, 1.0]])
 def test_a_mistyped_coordinate_does_not_change_the_predictions_of_the_others(tmp_path, mistype):
-    """After nine points of 27, the wrong one is the last."""
+    """After nine points of 27, the wrong one is the last; eight are in the file."""
     session, points = tracked(tmp_path)
-    write_session(session, tmp_path / "session", blank=True)
-    typed = [*points[:8], points[8] * mistype]
-    lines = "".join(" ".join(f"{v:.4f}" for v in point) + "\n" for point in typed)
-    _, out, _ = orthocal("record", tmp_path / "session", typed=lines + "quit\n")
+    in_file = np.where(np.arange(81) < 3 * 8, session.values, np.nan)
+    write_session(session.with_values(in_file), tmp_path / "session", decimals=4)
+    line = " ".join(f"{v:.4f}" for v in points[8] * mistype)
+    _, out, _ = orthocal("record", tmp_path / "session", typed=f"{line}\nquit\n")
     predicted = re.findall(r"predict ([xyz]) (\S+) ±", out)[-3:]
     assert [axis for axis, _ in predicted] == ["x", "y", "z"]
     assert [float(v) for _, v in predicted] == pytest.approx(points[8], abs=PREDICTED_MM)
