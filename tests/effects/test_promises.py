@@ -39,14 +39,20 @@ def check(outcome):
     assert outcome.covered_backlash.sum() >= least
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Plan with temperatures that go up and down."""
+    return write_plan(tmp_path_factory.mktemp("promises") / "plan")
+
+
 @pytest.mark.slow
-def test_intervals_and_tool_errors_with_all_effects(tmp_path):
-    machines = EffectMachines(write_plan(tmp_path / "plan"), EFFECTS)
+def test_intervals_and_tool_errors_with_all_effects(folder):
+    machines = EffectMachines(folder, EFFECTS)
     truth = machines.draw(np.random.default_rng(11), MACHINES)
     outcome = machines.identify(truth, np.random.default_rng(12))
     check(outcome)
     # a model without the effects has a larger tool error
-    plain = EffectMachines(machines.folder.parent, ())
+    plain = EffectMachines(folder, ())
     values = machines.read(truth, np.random.default_rng(12))
     names = machines.problem.free
     same = truth[:, [names.index(name) for name in plain.problem.free]]
@@ -64,6 +70,6 @@ def test_eight_hours_with_drift_and_growth(tmp_path):
 
 
 @pytest.mark.slow
-def test_effects_cost_little_on_machines_without_them(tmp_path):
-    told, plain = identify_nothing(write_plan(tmp_path / "plan"), MACHINES)
+def test_effects_cost_little_on_machines_without_them(folder):
+    told, plain = identify_nothing(folder, MACHINES)
     assert told < COST * plain
