@@ -10,6 +10,7 @@ import pytest
 from calibrated import SOUND
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
+from matplotlib.text import Text
 
 from orthocal import Choice, calibrate, load_plan, simulate_session
 from orthocal.assessment.tool_error import assess_tool
@@ -101,6 +102,10 @@ def texts(svg):
     return ["".join(e.itertext()) for e in ElementTree.fromstring(svg).iter(f"{SVG}text")]
 
 
+def drawn_texts(figure):
+    return [text.get_text() for text in figure.findobj(Text)]
+
+
 def test_there_is_a_panel_for_each_plane_through_the_middle(maps):
     for which, svg in maps.items():
         shown = texts(svg)
@@ -147,9 +152,8 @@ def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
     assert excess > 1.5
     within = assess_tool(identify(experiment_2, "offsets")[0])
     assert accuracy.after.sizes.aligned.rms > 1.5 * within.after.sizes.aligned.rms
-    shown = texts(tool_map.plot_tool_map(calibration, accuracy, which="uncertainty"))
-    label = f"RMS uncertainty in space [µm], tolerances × {excess:.1f}"
-    assert label in shown
+    shown = drawn_texts(draw(calibration, accuracy, "uncertainty"))
+    assert f"RMS uncertainty in space [µm], tolerances × {excess:.1f}" in shown
 
 
 def test_the_map_goes_through_the_points_of_the_grid(table1, accuracy):
@@ -228,7 +232,7 @@ def test_uncertainty_has_no_arrows(table1, accuracy):
 @pytest.mark.parametrize(("size", "number"), [(0.0, "0.0"), (1e6, "1000000")])
 def test_a_constant_error_is_printed_as_a_number(table1, accuracy, size, number):
     same = with_error(accuracy, lambda x, y, z: (0.0 * x, 0.0, size))
-    shown = texts(tool_map.plot_tool_map(table1, same, which="now"))
+    shown = drawn_texts(draw(table1, same, "now"))
     assert shown.count(f"{number} µm everywhere") == 3
 
 
@@ -288,14 +292,14 @@ def test_axes_are_the_coordinates_that_the_drives_control(planar):
 
 
 def test_no_map_without_uncertainty_further_errors_or_offsets_to_enter(table1, accuracy):
-    assert tool_map.plot_tool_map(table1, replace(accuracy, after=None), which="uncertainty") == ""
+    assert draw(table1, replace(accuracy, after=None), "uncertainty") is None
     settings = DeltaSettings("klipper", 0.14, (0.28,) * 3, (0.56,) * 3)
     printer = replace(table1, session=replace(table1.session, firmware=settings))
-    assert tool_map.plot_tool_map(printer, accuracy, which="entered") == ""
-    assert tool_map.plot_tool_map(printer, accuracy, which="now")
+    assert draw(printer, accuracy, "entered") is None
+    assert draw(printer, accuracy, "now")
     offsets = replace(table1, parameters=table1.parameters[:3])
-    assert tool_map.plot_tool_map(offsets, accuracy, which="entered") == ""
-    assert tool_map.plot_tool_map(offsets, accuracy, which="now")
+    assert draw(offsets, accuracy, "entered") is None
+    assert draw(offsets, accuracy, "now")
 
 
 @pytest.mark.parametrize("points_per_side", [2, 4])
