@@ -211,7 +211,7 @@ def test_core_reaches_the_targets_of_the_tip(full, core):
 
 
 def test_core_without_a_tool_equals_the_calibrated_machine(full, tmp_path):
-    """At points that were neither fitted nor checked, with all nodes and checks of a user's module."""
+    """At points that were neither fitted nor checked. Nodes and checks are those of a user."""
     approximation = approximate(full, within=WITHIN)
     core = Core(tmp_path, write_core(full, approximation, homes_of(full)))
     points = np.random.default_rng(8).uniform(-0.06, 0.06, (1000, 3))

@@ -355,7 +355,7 @@ def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
 
 @pytest.fixture(scope="module")
 def planned_bar(owned):
-    """Candidates and a planned setup of a ball bar with eight postures."""
+    """Candidates and a planned setup of a ball bar with twelve postures."""
     robot = replace(with_effects(load_robot("linear_delta"), ["backlash"]), legs={})
     equipment = Equipment(owned=owned(bar=BAR.replace("length_mm: 50", "length_mm: 60")))
     with few_balls(1):
@@ -363,7 +363,7 @@ def planned_bar(owned):
     forecast = ToolForecast(robot, resolve_choice("offsets", None).select(robot.parameters))
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     count = len(candidates.setups[0].rows)
-    planned = [PlannedSetup(0, tuple(np.random.default_rng(0).permutation(count)[:8].tolist()))]
+    planned = [PlannedSetup(0, tuple(np.random.default_rng(0).permutation(count)[:12].tolist()))]
     return candidates, planned
 
 
