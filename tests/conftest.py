@@ -166,7 +166,7 @@ def no_sensor_gains():
 @contextmanager
 def plans_of_few_candidates():
     """Plans of commands with few candidates and one start; tests/planning verify plans."""
-    from uncompared import uncompared
+    from uncompared import few_machines, uncompared
 
     from orthocal.planning import tool_candidates
 
@@ -179,7 +179,17 @@ def plans_of_few_candidates():
         patch.object(orthocal, "plan_readings", plan_readings),
         patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:2]),
         uncompared(),
+        few_machines(),
     ):
+        yield
+
+
+@pytest.fixture(scope="module")
+def module_of_few_machines():
+    """Plans of all tests of a module with expected errors of few machines."""
+    from uncompared import few_machines
+
+    with few_machines():
         yield
 
 

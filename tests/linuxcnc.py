@@ -26,6 +26,7 @@ import subprocess
 import tempfile
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -332,8 +333,12 @@ def build_module(folder, *, install=False):
 
 @contextmanager
 def few_nodes(degree=3):
-    """Modules of polynomials up to a lower degree, which are fitted at fewer points."""
-    with patch.dict(approximation.MAX_DEGREE, {3: degree}):
+    """Modules of polynomials up to a lower degree, which are fitted and checked at fewer points."""
+    few_checks = partial(approximation.check_points, count=250)
+    with (
+        patch.dict(approximation.MAX_DEGREE, {3: degree}),
+        patch.object(approximation, "check_points", few_checks),
+    ):
         yield
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack, contextmanager
 from unittest.mock import patch
 
-from orthocal.planning import cost_curve
+from orthocal.planning import cost_curve, expected_error
 from orthocal.planning.plan_comparison import Comparison
 
 
@@ -16,4 +16,11 @@ def uncompared():
         for name in ("list_alternatives", "list_usual_plans"):
             patches.enter_context(patch.object(Comparison, name, lambda _: ()))
         patches.enter_context(patch.object(cost_curve, "MAX_SETUPS", 1))
+        yield
+
+
+@contextmanager
+def few_machines():
+    """Expected errors of plans as means over two drawn machines."""
+    with patch.object(expected_error, "N_MACHINES", 2):
         yield

@@ -13,17 +13,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.calibrated_tool import TOOL_CACHE_SIZE, find_tool, place_tool
 from orthocal.assessment.controller_entries import lowers
-from orthocal.assessment.tool_error import assess_tool
+from orthocal.assessment.tool_error import assess_placed
 from orthocal.calibration.assessment_record import ToolErrorSummary
 from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.calibration.refit import restore_covariances
 from orthocal.errors import ClosureError, ExportError
+from orthocal.io.fields import read_only
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, box_workspace
 from orthocal.printers.firmwares import FIRMWARES
@@ -159,10 +161,13 @@ class _Targets:
     """Points of the first layer, on the bed."""
 
 
+@lru_cache(maxsize=TOOL_CACHE_SIZE)
 def fit_firmware(
     calibration: Calibration, firmware: FirmwareName, *, tool: ToolErrorSummary | None = None
 ) -> FirmwareFit:
     """Settings of a firmware with the smallest tool error.
+
+    Cached, because an export writes the settings and prints them.
 
     Args:
         calibration: Calibration whose session states the present settings of the firmware.
@@ -201,7 +206,7 @@ def fit_firmware(
         tool_uncertainty=math.nan if tool is None else tool.compensated,
         layer_uncertainty=layer_uncertainty,
         rows=_setting_rows(calibration, settings, gain),
-        gain=gain,
+        gain=read_only(gain),
     )
 
 
@@ -301,6 +306,7 @@ def _setting_rows(
     )
 
 
+@lru_cache(maxsize=TOOL_CACHE_SIZE)
 def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
     """Points over the workspace and on the bed, and the uncertainty of heights on the bed, [m].
 
@@ -322,7 +328,8 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
         carriages, layer_carriages = (
             calibration.machine.inverse(p @ tilt.T) + offsets for p in (space.points, layer)
         )
-        accuracy = assess_tool(calibration, Workspace.even(layer))
+        placed = place_tool(calibration, Workspace.even(layer))
+        after = assess_placed(calibration, placed, (), ()).after
     except ClosureError as e:
         raise ExportError(f"the calibrated machine does not reach the bed: {e}") from None
     layer_uncertainty, rotation_derivative = math.nan, _bed_rotation_derivative(calibration, bed)
@@ -335,12 +342,13 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
     )
 
     def place(points: Array, carriages: Array) -> _Points:
+        closed = to_errors.closure.close(carriages)
+        nozzle, drives = (tilt.T @ of(carriages, passive=closed) for of in (to_errors, to_drives))
         by_bed = -np.einsum("ijk,nj->nik", rotation_derivative, points)
-        jacobian = np.concatenate([tilt.T @ to_errors(carriages), by_bed], axis=2)
-        return _Points(points, carriages, jacobian, tilt.T @ to_drives(carriages))
+        return _Points(points, carriages, np.concatenate([nozzle, by_bed], axis=2), drives)
 
-    if accuracy.after is not None:
-        layer_uncertainty = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
+    if after is not None:
+        layer_uncertainty = math.sqrt(float(after.aligned_covariance[:, 2, 2].mean()))
     targets = _Targets(place(space.points, carriages), space.weights, place(layer, layer_carriages))
     return targets, layer_uncertainty
 

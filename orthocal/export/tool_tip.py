@@ -89,13 +89,21 @@ class ToolTip:
 
     def place(self, drives: Array, *, start: Array | None = None) -> Array:
         """Tips at drive coordinates, shape (k, n), [m]."""
-        poses = self.poses(drives, start=start)
+        return self._tips(drives, self._closure.close(drives, start=start))
+
+    def _tips(self, drives: Array, passive: Array) -> Array:
+        """Tips at drive coordinates with closed loops, shape (k, n), [m]."""
+        poses = self.poses(drives, passive)
         tips = poses[:, :3, 3] + poses[:, :3, :3] @ self.tool
         return np.asarray(tips[:, self.coordinates])
 
-    def poses(self, drives: Array, *, start: Array | None = None) -> Array:
-        """Poses of the robot's tool centre point, shape (k, 4, 4), [1, m]."""
-        passive = self._closure.close(drives, start=start)
+    def poses(self, drives: Array, passive: Array) -> Array:
+        """Poses of the robot's tool centre point, shape (k, 4, 4), [1, m].
+
+        Args:
+            drives: Drive coordinates, shape (k, n_drives), [m, rad].
+            passive: Passive coordinates that close the loops, shape (k, n_passive), [m, rad].
+        """
         (poses,) = self._pose(*self._closure.inputs(drives, passive))
         return np.asarray(poses)
 
@@ -121,7 +129,7 @@ class ToolTip:
             reached = np.isfinite(drives).all(axis=1)
             if not self.tool.any() or not reached.any():
                 return drives, passive
-            distance = targets[reached] - self.place(drives[reached], start=passive[reached])
+            distance = targets[reached] - self._tips(drives[reached], passive[reached])
             if np.abs(distance).max() < TOLERANCE:
                 return drives, passive
             shifted[reached] += distance

@@ -94,10 +94,11 @@ def test_the_bed_of_a_delta_is_read_on_a_grid_from_above(delta):
     assert steps.max() <= 0.07 + 1e-9  # short motions over the bed
     assert {r.approach for r in plan.readings} == {"nnn"}
     assert (plan.readings[-1].posture, plan.readings[-1].cycle) == (plan.readings[0].posture, 2)
-    (motion,) = [program for name, program in sheet_files(plan).items() if name.endswith(".ngc")]
+    files = sheet_files(plan)
+    (motion,) = [program for name, program in files.items() if name.endswith(".ngc")]
     heights = [float(z) for z in re.findall(r"(?m)^G53 .* Z(-?[\d.]+)", motion)]
     assert min(heights) == 0.0
-    sheet = sheet_files(plan)["sheet.html"]
+    sheet = files["sheet.html"]
     assert "by eye, once: the tool at x 0, y 0, z 0 mm" in sheet
     assert "a little upwards" in sheet
 

@@ -16,7 +16,7 @@ from bounds import rms_band
 from calibrated import identified
 from models import JOINTS
 from planned import FEW, QUICK
-from uncompared import uncompared
+from uncompared import few_machines, uncompared
 
 from orthocal import (
     Choice,
@@ -253,7 +253,7 @@ def test_further_setups_have_the_adjustments_of_the_measured_session(tmp_path):
     planned = shimmed_plan(tmp_path / "mine")
     amounts = {next(iter(planned.robot.declared.adjustments)): 0.5e-3}
     measured = replace(simulate_session(planned, {}).session, adjusted=amounts)
-    with uncompared():
+    with uncompared(), few_machines():
         plan = plan_readings(
             planned.robot, setups=1, measured=measured, equipment=Equipment(**FEW), starts=1
         )
@@ -275,7 +275,7 @@ def test_setups_are_named_after_their_legs(orthoglide):
     """Also if the names of the legs end in numbers."""
     legs = {f"leg_{i}": leg for i, leg in enumerate(orthoglide.legs.values(), 1)}
     legs = {name: replace(leg, name=name) for name, leg in legs.items()}
-    with uncompared():
+    with uncompared(), few_machines():
         plan = plan_readings(replace(orthoglide, legs=legs), equipment=Equipment(**FEW), starts=1)
     assert {s.name[1:] == s.sensor.leg for s in plan.session.setups.values()} == {True}
 
@@ -293,7 +293,7 @@ def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
 
 
 def test_a_plan_uses_the_available_hours(orthoglide):
-    with uncompared():
+    with uncompared(), few_machines():
         plan = plan_readings(orthoglide, "full", hours=1.0, starts=1, equipment=Equipment(**FEW))
     assert 45.0 < plan.minutes <= 60.0
 
@@ -364,7 +364,8 @@ def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide
     """The paper's readings differ by more than ±0.4 mm."""
     equipment = Equipment(gauge=Gauge(5e-6, 10e-6, (-4e-4, 4e-4)), **FEW)
     choice = Choice("full", tolerances={"*.offset_mm": 0.4})
-    plan = plan_readings(orthoglide, choice, equipment=equipment, starts=1)
+    with few_machines():
+        plan = plan_readings(orthoglide, choice, equipment=equipment, starts=1)
     assert [(a.name, a.expected) for a in plan.usual_plans] == [
         ("the paper's", None),
         ("even", None),
@@ -404,7 +405,8 @@ def plan_badly(robot, monkeypatch, **options):
     """Plan of a search that returns the first candidate setup twice."""
     monkeypatch.setattr(planning, "_search_setups", worst_setups)
     choice = Choice("full", tolerances=OFFSETS)
-    return plan_readings(robot, choice, setups=2, equipment=Equipment(**QUICK), **options)
+    with few_machines():
+        return plan_readings(robot, choice, setups=2, equipment=Equipment(**QUICK), **options)
 
 
 def worst_setups(timed, candidates, options, work):

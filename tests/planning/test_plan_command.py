@@ -35,7 +35,7 @@ from orthocal.runtime import worker_pool
 from orthocal.runtime.interrupts import INTERRUPTED
 from orthocal.session.session import Purpose
 
-pytestmark = pytest.mark.usefixtures("without_sensor_gains")
+pytestmark = pytest.mark.usefixtures("without_sensor_gains", "module_of_few_machines")
 
 QUICK = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
 DIAL = """sigma_mm: 0.002

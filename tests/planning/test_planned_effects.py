@@ -33,6 +33,8 @@ from orthocal.planning.plan import plan_readings
 from orthocal.session.session import Gauge
 from orthocal.units import MM, PPM, UM
 
+pytestmark = pytest.mark.usefixtures("module_of_few_machines")
+
 WITHOUT_BACKLASH = 24
 """Readings of the first plan of a machine without backlash, closing readings included."""
 
@@ -136,8 +138,8 @@ def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
     limits = ((0.262, 0.353),) * 3
     with uncompared():
         plans = [
-            plan_readings(robot, setups=2, equipment=replace(FEW, soft_limits=soft), starts=1)
-            for soft in ((), limits)
+            plan_readings(robot, "offsets", setups=2, equipment=equipment, starts=1)
+            for equipment in (FEW, replace(FEW, soft_limits=limits))
         ]
     assert "MAX_LIMIT" in describe_beyond_limits(plans[0].session, limits, file="machine.ini")
     assert describe_beyond_limits(plans[1].session, limits, file="machine.ini") == ""

@@ -17,7 +17,7 @@ from commands import run_orthocal
 from machines import frame_pose, frames
 from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
-from uncompared import uncompared
+from uncompared import few_machines, uncompared
 
 from orthocal import (
     load_plan,
@@ -119,7 +119,7 @@ def test_a_plan_from_a_better_usual_plan_takes_the_stated_time(owned, monkeypatc
         return timed.search.plan_of([PlannedSetup(which, (0, 1))] * 5)
 
     monkeypatch.setattr(planning, "_search_setups", search_badly)
-    with few_balls(2):
+    with few_balls(2), few_machines():
         plan = plan_readings(entered("orthoglide"), hours=1.0, equipment=equipment, starts=1)
     assert plan.usual_plans
     assert plan.minutes <= 60.0 + 1e-9
@@ -245,8 +245,8 @@ def test_approaches_and_minutes_of_a_bar_follow_from_path_and_file(owned):
     robot = replace(with_effects(entered("orthoglide"), ("backlash",)), legs={})
     slow = BAR + "minutes_per_setup: 20\nminutes_per_reading: 2\n"
     equipment = Equipment(owned=owned(bar=slow))
-    with few_balls(1), uncompared():
-        plan = plan_readings(robot, hours=1.0, equipment=equipment, starts=1)
+    with few_balls(1), uncompared(), few_machines():
+        plan = plan_readings(robot, "offsets", hours=1.0, equipment=equipment, starts=1)
     session = plan.session
     assert all(r.approach and len(r.approach) == 3 for r in session.readings)
     plan_motion(session)  # refuses approaches that are not those of the path
@@ -510,7 +510,7 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
 def test_a_sensor_with_too_short_a_range_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
     short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
-    with few_balls(1), uncompared():
+    with few_balls(1), uncompared(), few_machines():
         plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
     assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
     assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
@@ -531,7 +531,7 @@ def test_a_sensor_with_too_short_a_range_is_named(owned):
 def test_a_sensor_that_gains_less_than_others_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
     noisy = owned(bar=BAR.replace("sigma_mm: 0.002", "sigma_mm: 1"))
-    with few_balls(1), uncompared():
+    with few_balls(1), uncompared(), few_machines():
         plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=noisy, **FEW), starts=1)
     assert plan.unchosen == {"bar": 0.0}
     title, *_, last = summarize(plan).split("\n\n")
@@ -713,7 +713,7 @@ def test_a_plan_of_points_is_measured_and_calibrated(tmp_path):
     words = ["orthoglide", "--with", tmp_path / "track.yaml", "--hours", 0.45, "--starts", 1]
     words += ["--along", 2, "--across-mm", 0, "--sections", 0.5]
     words += ["--tolerance", "*.offset_mm=1", "--out", tmp_path / "plan"]
-    with uncompared():
+    with uncompared(), few_machines():
         code, text, _ = run_orthocal(".", "plan", *map(str, words))
     assert code == 0
     assert "Points: " in text

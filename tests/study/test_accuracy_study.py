@@ -63,7 +63,7 @@ def test_gauges_of_different_noise(workshop):
 
     columns, predicted = [], []
     for order in (noise, reversed(noise)):
-        study = study_of(*order, machines=5)
+        study = study_of(*order, machines=3)
         columns.append(run_study(study).columns)
         predicted.append(study.predicted.reported.rms)
     for name in ("tool_um", "error.x_slide.offset_mm"):

@@ -386,9 +386,7 @@ def _assess(
         coordinates=tuple(first.tip.coordinates),
         achieved=error,
         checked=len(checks),
-        nominal_error=_nominal_error(
-            first.tip, inverse.nominal, checks, calibration.active_offsets
-        ),
+        nominal_error=_nominal_error(first, inverse.nominal, checks, calibration.active_offsets),
         error_beyond=_error_beyond(first.tip, inverse, calibration),
         error_of_longer_tool=_error_of_longer_tool(first.tip, first.expected, first.passive),
         error_without_thermometer=max(
@@ -453,9 +451,11 @@ def _tip_error(
     return float(np.linalg.norm(error, axis=1).max())
 
 
-def _nominal_error(tip: ToolTip, form: NominalForm, points: Array, offsets: Array) -> float | None:
+def _nominal_error(state: _State, form: NominalForm, checks: Array, offsets: Array) -> float | None:
     """Largest error with nominal kinematics and offsets, [m]; None without a closed form."""
-    return None if isinstance(form, Tangent) else _tip_error(tip, points, form(points) - offsets)
+    if isinstance(form, Tangent):
+        return None
+    return _tip_error(state.tip, checks, form(checks) - offsets, start=state.passive)
 
 
 def _error_beyond(
@@ -475,5 +475,5 @@ def _error_beyond(
 
 def _error_of_longer_tool(tip: ToolTip, drives: Array, passive: Array) -> float:
     """Largest error for a tip displaced by LONGER_TOOL, because of the platform's tilt, [m]."""
-    tilt = (tip.poses(drives, start=passive)[:, :3, :3] - tip.level)[:, tip.coordinates]
+    tilt = (tip.poses(drives, passive)[:, :3, :3] - tip.level)[:, tip.coordinates]
     return float(LONGER_TOOL * np.linalg.svd(tilt, compute_uv=False).max())
