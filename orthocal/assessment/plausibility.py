@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -148,7 +149,8 @@ def _coarser_step(values: Array, step: float) -> float:
 def find_finer(session: Session) -> Iterator[Finding]:
     """Findings about gauges with readings between the steps.
 
-    They are notes about fewer than half of the readings, unless these are all of a setup.
+    They are notes about fewer than half of the readings, unless these are all of a setup and one
+    is finer than the eye divides a step.
     """
     for name, gauge in session.gauges_with_readings.items():
         rows = _rows_of(session, name)
@@ -156,12 +158,10 @@ def find_finer(session: Session) -> Iterator[Finding]:
             step = gauge.resolution or 0.0
             inches = _are_inches(session.values[rows], step)
             evidence = _evidence(session, finer)
+            finest = _finer_rows(session, rows, replace(gauge, resolution=step / 10.0))
             by_setup = group_rows(session.readings[i].setup for i in rows)
-            complete = [
-                setup
-                for setup, places in by_setup.items()
-                if len(places) > 1 and {rows[k] for k in places} <= set(finer)
-            ]
+            rows_of = {setup: {rows[k] for k in places} for setup, places in by_setup.items()}
+            complete = [s for s, own in rows_of.items() if own <= set(finer) and own & set(finest)]
             yield words.finer_than_gauge(
                 len(finer),
                 len(rows),

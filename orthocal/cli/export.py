@@ -132,6 +132,11 @@ def _note_assumptions(
     from orthocal.export.linuxcnc.export import assumes_latching
 
     put_note(note_wrong_order(calibration))
+    if module and options.module is None and options.home_offsets:
+        put_note(
+            "A kinematics module does not change HOME_OFFSET. For HOME_OFFSET of the offsets alone "
+            "add --offsets."
+        )
     if assumes_latching(calibration, options):
         unstated = "" if ini is None else f" ({ini} does not state it for every joint)"
         put_note(

@@ -76,10 +76,15 @@ def test_few_readings_between_the_steps_are_a_note_unless_all_of_a_setup():
     session = session_of("workshop")
     of_setup = np.array([r.setup == next(iter(session.setups)) for r in session.readings])
     rows = np.flatnonzero(of_setup)[1:]
-    few, inches = session.values, session.values
+    few, halves, inches = session.values, session.values, session.values
     few[rows] += 3e-6
+    halves[of_setup] += 5e-6  # read between two marks
     inches[of_setup] = np.round(inches[of_setup] / 25.4, 7)
-    for values, severity, count in ((few, "note", 2.0), (inches, "review", 3.0)):
+    for values, severity, count in (
+        (few, "note", 2.0),
+        (halves, "note", 3.0),
+        (inches, "review", 3.0),
+    ):
         (finer,) = find_finer(session.with_values(values))
         assert (finer.severity, finer.numbers["readings_between_steps"]) == (severity, count)
     assert not [f for f in find_warnings(session.with_values(few)) if f.severity == "note"]

@@ -40,6 +40,7 @@ from orthocal.kinematics.conditions import sample_use
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.workspace import box_workspace, cube_limits, tool_at_zero
 from orthocal.planning.expected_error import ToolForecast
+from orthocal.units import MM
 
 EFFECTS = "backlash: {}, thermal: {}, compliance: {rod_N_per_um: 0.2, platform_kg: 3}"
 USE = "use: {temperature_C: [15, 35], payload_kg: [0, 4]}"
@@ -299,7 +300,9 @@ def test_the_assessment_states_the_tool_error_in_use(calibration, tmp_path):
     assert "approaches from both sides, 15…35 °C, payload 0…4 kg." in text
     assert "With the backlash that the controller compensates now: " in text
     assert "Temperatures of 15…35 °C add" in text
-    assert "A payload of 0…4 kg adds" in text
+    added = float(re.search(r"A payload of 0…4 kg adds ([0-9.]+) mm", text)[1])
+    without = np.sqrt(tool.entered**2 - tool.use.parts[-1].size ** 2)
+    assert added == pytest.approx((tool.entered - without) / MM, abs=5e-4)
 
 
 # ---- commands

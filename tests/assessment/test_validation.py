@@ -524,7 +524,12 @@ def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(
     errors, first, calibration = calibrated_machine("raw-cycles", "full", 3)
     session = measure_again(plan, calibration, errors, seed=4, sigma=15e-6)
     result = validate_calibration(calibration, session)
-    assert result.assessment.of_kind("larger than predicted")
+    (larger,) = result.assessment.of_kind("larger than predicted")
+    limit = float(re.search(r"\(limit ([0-9.]+) mm\)", larger.text)[1])
+    assert larger.numbers["limit_of_pattern_mm"] == pytest.approx(limit, abs=5e-4)
+    fit = repeat_fit(calibration, session)
+    worst = judge_deviations(calibration, fit).worst_setup
+    assert larger.places[0].setup == list(fit.problem.session.setups)[worst]
     document = json.loads(result_json(result))
     assert document["confirmed"] is False
     assert document["decision"]["exit_code"] == 3

@@ -319,9 +319,14 @@ def _read_spreadsheet_table(path: Path, content: bytes, text: str) -> tuple[Tabl
         raise SessionError(f"{e.problem} of `orthocal import`", where=where) from None
     names = [shorten(" ".join(name.split())) for name in table.header]
     if columns.extra:
+        first = columns.extra[0]
+        found = (
+            f"unknown column '{names[first]}'"
+            if names[first]
+            else f"column {first + 1} has no heading"
+        )
         raise SessionError(
-            f"unknown column '{names[columns.extra[0]]}'; expected {', '.join(REQUIRED)} and "
-            f"optionally {', '.join(OPTIONAL)}",
+            f"{found}; expected {', '.join(REQUIRED)} and optionally {', '.join(OPTIONAL)}",
             where=where,
         )
     for i, heading in columns.readings.items():
@@ -352,7 +357,8 @@ def _spreadsheet_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
             names = SEPARATORS[table.separator or "comma"].join(table.header)
             count = row.width if row.width < width else len(row.cells)
             raise SessionError(
-                f"has {count} fields; expected {width} ({shorten(names)})", where=where
+                f"has {count} field{'s' * (count != 1)}; expected {width} ({shorten(names)})",
+                where=where,
             )
         cells = {
             COLUMN_OF_ROLE.get(role, role): composed(row.cell(index).text.strip())

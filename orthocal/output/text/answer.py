@@ -205,8 +205,11 @@ def describe_conditions(calibration: Calibration) -> list[str]:
     tool = assessment_of(calibration).tool
     if tool is None:
         return []
-    compensated = [] if calibration.only_offsets else [describe_compensated(tool.compensated)]
-    return [*compensated, describe_region(tool), *describe_use_parts(tool)]
+    compensated = describe_compensated(tool.compensated)
+    if calibration.session.firmware is not None:  # no other sentence introduces the tool error
+        compensated = f"Expected tool error {uncapitalised(compensated)}"
+    first = [] if calibration.only_offsets else [compensated]
+    return [*first, describe_region(tool), *describe_use_parts(tool)]
 
 
 def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
