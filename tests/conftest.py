@@ -178,6 +178,7 @@ def plans_of_few_candidates():
         patch.object(orthocal, "Equipment", lambda **stated: equipment(**stated | FEW)),
         patch.object(orthocal, "plan_readings", plan_readings),
         patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:2]),
+        patch.object(tool_candidates, "BED_POINTS", 5),
         uncompared(),
         few_machines(),
     ):

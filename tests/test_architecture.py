@@ -204,8 +204,9 @@ UNNEEDED_LIBRARIES = {
 
 def test_calibrate_imports_what_it_needs():
     command = "calibrate", str(ROOT / "examples/table1/experiment-2")
-    modules_after(*command)  # fills the cache
+    unneeded = UNNEEDED_LIBRARIES | {f"orthocal.{name}" for name in UNNEEDED}
     loaded = modules_after(*command)
+    if unneeded & loaded:  # to compile functions that the cache does not hold
+        loaded = modules_after(*command)
     assert "orthocal.estimation.fit" in loaded
-    assert not {f"orthocal.{name}" for name in UNNEEDED} & loaded
-    assert not UNNEEDED_LIBRARIES & loaded
+    assert not unneeded & loaded

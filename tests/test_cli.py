@@ -467,23 +467,30 @@ def test_solve_without_convergence_exits_1(experiment, monkeypatch, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.fixture(scope="module")
+def swapped(root, tmp_path_factory):
+    """Directory of a session with two swapped readings, and its decision."""
+    folder = tmp_path_factory.mktemp("swapped") / "session"
+    session = load_session(root / "examples/workshop")
+    values = session.values.copy()
+    values[[12, 13]] = values[[13, 12]]
+    write_session(session.with_values(values), folder)
+    return folder, check_session(load_session(folder)).decision
+
+
 @pytest.mark.parametrize(
     "words",
     [["calibrate", "--model", "offsets"], ["compare", "--models", "offsets", "--json"]],
     ids=" ".join,
 )
-def test_verdict_is_printed_although_the_solver_fails(root, tmp_path, monkeypatch, words):
+def test_verdict_is_printed_although_the_solver_fails(swapped, monkeypatch, words):
     from orthocal.estimation.solvers import ipopt as nlp
 
     monkeypatch.setattr(nlp, "CONVERGED", frozenset())
-    session = load_session(root / "examples/workshop")
-    values = session.values.copy()
-    values[[12, 13]] = values[[13, 12]]
-    write_session(session.with_values(values), tmp_path / "swapped")
-    code, out, err = orthocal(*words, tmp_path / "swapped")
+    folder, decision = swapped
+    code, out, err = orthocal(*words, folder)
     assert code == 3
     assert "converge" not in err
-    decision = check_session(load_session(tmp_path / "swapped")).decision
     if "--json" in words:
         document = json.loads(out)
         assert document["decision"] == decision.to_document()

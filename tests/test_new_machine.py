@@ -28,6 +28,7 @@ from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
+from orthocal.output.sheet import page
 from orthocal.planning import tool_candidates
 from orthocal.planning.equipment import USUAL_BALL
 from orthocal.session.session import Purpose
@@ -50,6 +51,12 @@ PROGRAMS = [f"{i:02d}-{name}.ngc" for i, name in enumerate("yx zx xy zy xz yz".s
 def options(**changed):
     given = {**SIZES, **{f"--{k.replace('_', '-')}": v for k, v in changed.items()}}
     return [word for option, value in given.items() if value for word in (option, value)]
+
+
+@pytest.fixture
+def unsheeted(monkeypatch):
+    """A mark in place of sheets and programs."""
+    monkeypatch.setattr(page, "sheet_files", lambda *_, **__: {"sheet.html": "<html></html>"})
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +94,7 @@ def test_a_new_directory_has_all_files(made):
     assert session.purpose == Purpose("full")
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_a_new_machine_has_backlash(made, tmp_path):
     """It is identified from readings that state their approach; 0.03 mm come back."""
     robot = load_robot(made)
@@ -105,6 +113,7 @@ def test_a_new_machine_has_backlash(made, tmp_path):
     assert load_robot(folder).effect_names == ("backlash", "thermal")
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_a_new_machine_has_screws_of_a_lead(tmp_path):
     folder = tmp_path / "screws"
     assert orthocal("new", folder, *options(), "--paper", "--screw-lead-mm", "5").returncode == 0
@@ -243,6 +252,7 @@ def planned(tmp_path_factory, short_reports, quick_plans):
     return mill, orthocal("new", mill, *words)
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_a_gauge_without_a_tip_has_the_usual_ball(tmp_path):
     """The line between two rods, which the gauge would read without a tip, is empty space."""
     dial, folder = tmp_path / "dial.yaml", tmp_path / "my mill"
@@ -408,6 +418,7 @@ def test_a_damaged_plan_is_not_called_out_of_reach(copied, file, content):
     assert "does not reach" not in err
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_existing_files_are_not_overwritten(copied):
     before = (copied / "mill.urdf").read_text()
     given = ["new", copied, *options(leg_mm="260"), "--paper"]
@@ -442,6 +453,7 @@ def talk(command, answers, cwd):
     return process.wait(timeout=300), said.decode(errors="replace").replace("\r\n", "\n")
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_invalid_answers_are_asked_for_again(tmp_path):
     answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
     answers += ["sideways\n", "up,down,up\n", "0\n", "90\n", "40:30\n", "-50:60,-50:60,-40:40\n"]
@@ -530,6 +542,7 @@ DELTA = [
 ]
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path, monkeypatch):
     monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:3])
     code, said, _ = orthocal("new", tmp_path / "delta", *DELTA)
@@ -543,6 +556,7 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path, mon
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path, without_sensor_gains):
     """The workspace of a linear delta depends on its radius; short slides do not reach it."""
     short = [w.replace("30:560", "200:300") for w in DELTA]
@@ -556,6 +570,7 @@ def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path, wit
     assert orthocal("new", tmp_path / "delta", *short, box).returncode == 0
 
 
+@pytest.mark.usefixtures("unsheeted")
 def test_stated_sensors_are_planned(tmp_path, quick_plans, without_sensor_gains):
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
     (tmp_path / "bar.yaml").write_text(bar)

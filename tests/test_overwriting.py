@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from functools import cache
+from unittest.mock import patch
 
 import pytest
 from calibrated import EXPERIMENT_2, calibrated
@@ -11,12 +13,18 @@ from linuxcnc import few_nodes
 
 from orthocal import write_calibration
 from orthocal.cli.overwriting import WRITTEN
+from orthocal.export.linuxcnc import approximation, export
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cheap_results(short_reports):
-    """Short reports and modules of few nodes: complete ones have tests of their own."""
-    with few_nodes():
+    """Short reports, and one module of few nodes: complete ones have tests of their own."""
+
+    @cache
+    def approximate(**options):
+        return approximation.approximate(calibrated(EXPERIMENT_2), **options)
+
+    with few_nodes(), patch.object(export, "approximate", lambda _, **o: approximate(**o)):
         yield
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from commands import run_orthocal
+from conftest import marked_reports
 from uncompared import uncompared
 
 from orthocal import (
@@ -31,8 +32,14 @@ OPTION = [word for key, value in STATED.items() for word in ("--tolerance", f"{k
 QUICK = "--along 3 --across-mm 0 --sections 0.5 --setups 3 --starts 1 --seed 1".split()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def without_reports():
+    with marked_reports():
+        yield
+
+
 @pytest.fixture(scope="module")
-def folder(root, tmp_path_factory, short_reports):
+def folder(root, tmp_path_factory, without_reports):
     """Experiments 2 and 3 without and with the key, and a calibration of each."""
     folder = tmp_path_factory.mktemp("tolerances")
     for number in (2, 3):

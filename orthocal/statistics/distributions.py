@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from statistics import NormalDist
 
 import numpy as np
@@ -46,7 +47,7 @@ def log_positive_share(mean: Array, covariance: Array) -> float:
     from scipy.special import log_ndtr, ndtri_exp
 
     factor = np.linalg.cholesky(covariance)
-    log_points = np.log(_lattice(mean.size - 1))
+    log_points = _log_lattice(mean.size - 1)
     z = np.zeros((LATTICE, mean.size))
     log_probabilities = np.zeros(LATTICE)
     for i, (mean_i, row) in enumerate(zip(mean, factor, strict=True)):
@@ -57,14 +58,17 @@ def log_positive_share(mean: Array, covariance: Array) -> float:
     return float(np.logaddexp.reduce(log_probabilities) - math.log(LATTICE))
 
 
-def _lattice(dimensions: int) -> Array:
-    """Points of a Kronecker sequence in the unit cube, shape (LATTICE, dimensions)."""
+@cache
+def _log_lattice(dimensions: int) -> Array:
+    """Logarithms of a Kronecker sequence in the unit cube, shape (LATTICE, dimensions)."""
     root = 2.0
     for _ in range(64):  # x = (1 + x)^(1 / (d + 1))
         root = (1.0 + root) ** (1.0 / (dimensions + 1))
     steps = root ** -np.arange(1.0, dimensions + 1)
     wrapped = (np.arange(1, LATTICE + 1)[:, None] * steps) % 1.0
-    return np.asarray(np.clip(1.0 - np.abs(2.0 * wrapped - 1.0), 1e-12, 1.0))
+    log_points: Array = np.log(np.clip(1.0 - np.abs(2.0 * wrapped - 1.0), 1e-12, 1.0))
+    log_points.flags.writeable = False
+    return log_points
 
 
 def chi_square_tail(dof: float, value: float) -> float:
