@@ -83,6 +83,8 @@ class FamilyScorer:
         base = likelihood.products(deviation[None])
         sound = float(likelihood.score(base)[0])
         for family in families:
+            if not family.count:
+                continue
             if family.groups:
                 logs = np.array(
                     [

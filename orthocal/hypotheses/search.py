@@ -194,7 +194,7 @@ class _Search:
             if f.systematic
             and evidence[0] > CLEAR_EFFECT_LOG_BAYES - np.log(N_FAMILIES) - COARSE_MARGIN
         ]
-        totals = [log_of_sum(evidence) for _, evidence in scored if evidence.size]
+        totals = [log_of_sum(evidence) for _, evidence in scored]
         pairs: list[tuple[Term, Term]] = []
         total = -np.inf
         if len(state.terms) + 2 <= MAX_ANOMALIES:

@@ -36,6 +36,7 @@ from orthocal.hypotheses.search import find_anomalies
 from orthocal.hypotheses.set_evaluation import score_silent
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.first_plan import paper_plan
+from orthocal.units import MM
 
 
 @pytest.fixture(scope="module")
@@ -351,3 +352,12 @@ def test_large_offsets_are_no_anomaly(tmp_path):
     assert not find_anomalies(session).found
     sizes = LinearModel(session).most_likely(session.values).theta
     assert np.abs(sizes).max() < LARGEST_ERROR
+
+
+def test_a_few_readings_in_inches_are_searched():
+    """Nine readings as `record` has them; a family of mistakes has no member among them."""
+    plan = plan_of("raw-cycles")
+    typed = [0.18, -0.57, 1.92, 0.2, -0.56, 1.89, 0.22, -0.58, 1.92]
+    values = np.round(np.array(typed) / 25.4, 6) * MM
+    session = replace(plan, readings=plan.readings[: len(typed)]).with_values(values)
+    assert find_anomalies(session).found
