@@ -135,12 +135,12 @@ def write_plan(
     path = write_session(session, directory, comment=comment, extra=files, blank=True)
     others = [directory / "sheet.html", directory / "plan.json", *directory.glob("[0-9]*-*.ngc")]
     old = sorted(p for p in others if p.name not in files and exists(p) and _is_marked(p))
-    old += [p.with_suffix(".svg") for p in old if p.suffix == ".json"]
+    old += [p for p in (q.with_suffix(".svg") for q in old if q.suffix == ".json") if exists(p)]
     for file in old:
         with suppress(OSError):
             file.unlink()
-    if old:
-        put_note(f"Removed from the earlier plan: {', '.join(p.name for p in old)}")
+    if removed := [p.name for p in old if not exists(p)]:
+        put_note(f"Removed from the earlier plan: {', '.join(removed)}")
     return path
 
 
