@@ -60,7 +60,7 @@ class InUnit:
 
     @property
     def unit_in_text(self) -> str:
-        """The same unit as sentences write it."""
+        """Unit as sentences write it."""
         return unit_in_text(self.unit)
 
     @property

@@ -77,7 +77,7 @@ class Noise:
         )
 
     def with_sigma(self, sigma: float) -> Noise:
-        """The same noise with another standard deviation of a reading, unless it is unknown."""
+        """Noise with another standard deviation of a reading, unless it is unknown."""
         return self if math.isnan(self.sigma) else replace(self, sigma=sigma)
 
     def at_least(self, floor: float) -> Noise:
