@@ -299,18 +299,18 @@ class _Search:
         return state
 
     def _confirm(self, state: HypothesisSet) -> tuple[HypothesisSet, list[HypothesisSet]]:
-        """Remove hypotheses that a plausible machine makes superfluous.
+        """Remove hypotheses that the others and a plausible machine make superfluous.
+
+        One hypothesis alone remains: several similar ones may have been clear together.
 
         Returns:
             The set, and the sets without each of its hypotheses, about the most likely machine of
             their readings if that is more likely.
         """
-        while True:
-            without = [self.sound for _ in state.terms]
-            if len(state.terms) > 1:
-                near = self.sets.evaluate_all(_reduced(state), self.sound.about)
-                own = [self.sets.most_likely(s.terms) or s for s in near]
-                without = [min(p, key=negative_log_posterior) for p in zip(near, own, strict=True)]
+        while len(state.terms) > 1:
+            near = self.sets.evaluate_all(_reduced(state), self.sound.about)
+            own = [self.sets.most_likely(s.terms) or s for s in near]
+            without = [min(p, key=negative_log_posterior) for p in zip(near, own, strict=True)]
             superfluous = [
                 s
                 for t, s in zip(state.terms, without, strict=True)
@@ -319,6 +319,7 @@ class _Search:
             if not superfluous:
                 return state, without
             state = min(superfluous, key=negative_log_posterior)
+        return state, [self.sound for _ in state.terms]
 
     def _expected(self, state: HypothesisSet, row: int) -> float:
         """Prediction of a row from all other corrected rows, as in a recording, [m]."""

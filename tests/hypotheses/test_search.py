@@ -29,6 +29,7 @@ from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.families.wrong_readings import wrong_readings
+from orthocal.hypotheses.family_scores import CLEAR_LOG_BAYES
 from orthocal.hypotheses.hypothesis import MAX_DENSE_COLUMNS, Rows, to_dense
 from orthocal.hypotheses.likelihood import AmountPrior
 from orthocal.hypotheses.linear_model import LARGEST_ERROR, LinearModel, linear_model
@@ -361,3 +362,14 @@ def test_a_few_readings_in_inches_are_searched():
     values = np.round(np.array(typed) / 25.4, 6) * MM
     session = replace(plan, readings=plan.readings[: len(typed)]).with_values(values)
     assert find_anomalies(session).found
+
+
+@pytest.mark.parametrize(
+    ("seed", "name"), [(1, "postures exchanged, all setups"), (3, "legs exchanged")]
+)
+def test_similar_hypotheses_that_are_clear_together_are_reported(seed, name):
+    """The most likely one alone is below the limit."""
+    session = sound_session(plan_of("raw-cycles"), seed, entered=True)
+    made = {n: m for n, _, m in make_mistakes(session, seed, sizes=())}[name]
+    (anomaly,) = find_anomalies(session.with_values(made.values)).found
+    assert anomaly.log_evidence < CLEAR_LOG_BAYES
