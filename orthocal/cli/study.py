@@ -42,6 +42,7 @@ from orthocal.cli.options import (
     split_effects,
     split_globs,
 )
+from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import deliver, put_note
 from orthocal.errors import ParameterError
 from orthocal.io.files import Content, require_writable
@@ -327,7 +328,8 @@ def _run(study: orthocal.Study, options: RunOptions) -> None:
             where="--workers",
         )
     if out is not None:
-        require_writable(out, [JOURNAL, *FILES])
+        require_writable(out, [JOURNAL])
+        require_replaceable_results(out, dict.fromkeys(FILES, ""), force=options.force)
     count = options.workers or available_cores()
     resume = "with --out it can be resumed" if out is None else "the same command resumes it"
     with message_at_interrupt(f"orthocal: stopped; {resume}"):
