@@ -324,7 +324,7 @@ class ToolForecast:
         if possible.sum() <= o.n_free_zeros:
             return None, lost
         o, noise = o.only(possible), stated_sigma(problem.session.gauge)
-        inflation = np.ones((o.size, 1))  # of the standard deviations by which readings are weighted
+        inflation = np.ones((o.size, 1))  # of the standard deviations for weighting
         if weights is not None:
             inflation = (weights / (noise * problem.noise_ratio))[possible, None]
         precision = np.maximum(problem.prior_precision, VAGUE)
