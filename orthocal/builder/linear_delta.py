@@ -225,5 +225,6 @@ class LinearDelta(Dimensions):
             parameters=parameters,
             models={"delta": DELTA_MODEL},
             workspace=self.box,
+            bed=0.0,
             tolerances="offset_mm: 4, translation_mm: 1, rotation_mrad: 5, scale_ppm: 500",
         )

@@ -16,6 +16,8 @@ TWO_RODS = {"a": ("{k}_bar_a", "{k}_coupler"), "b": ("{k}_bar_b", "{k}_rod_b_tip
 ONE_ROD = {"a": ("{k}_bar", "{k}_end")}
 """Frames at both ends of a single rod; {k} is the leg."""
 
+BED_COMMENT = "  # No plan and no program moves the tool below the bed."
+"""Comment before the key of a bed."""
 
 MODELS = {"offsets": ("*.offset",), "lengths": ("*.offset", "*_leg.length")}
 """Free errors of the models of every machine, except the model full."""
@@ -69,6 +71,7 @@ def robot_yaml(
     tip: str = "{k}_leg_tip",
     coordinates: str = "xyz",
     workspace: Sequence[Sequence[float]] | None = None,
+    bed: float | None = None,
     tolerances: str = WORKSHOP_TOLERANCES,
 ) -> str:
     """YAML of a machine.
@@ -85,15 +88,14 @@ def robot_yaml(
         tip: Frame at the end of a leg k.
         coordinates: Coordinates of the tool that the drives command.
         workspace: Limits of the workspace relative to the mechanical zero, [m].
+        bed: Lowest coordinate z of the tool relative to the mechanical zero, [m].
         tolerances: Tolerances as YAML.
     """
-    models = {**MODELS, **(models or {})}
-    box = [] if workspace is None else [f"  workspace: {{box_mm: {box_text(workspace)}}}"]
     lines = [
         f"# {title}",
         *_gepetto_lines(letters, loops),
         "orthocal:",
-        *box,
+        *_place_lines(workspace, bed),
         "  # One entry for each pair of closed_loop, in its order. Rows that depend on others are",
         "  # omitted, as in planar loops.",
         "  closures:",
@@ -112,10 +114,21 @@ def robot_yaml(
         f"  tolerances: {{{tolerances}}}",
         "  # Free errors of each model. complete: every error that moves a rod or the tool.",
         "  models:",
-        *(f"    {name}: [{', '.join(map(repr, globs))}]" for name, globs in models.items()),
-        "    full: complete",
+        *_model_lines({**MODELS, **(models or {})}),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _place_lines(workspace: Sequence[Sequence[float]] | None, bed: float | None) -> list[str]:
+    """YAML of workspace and bed; see `robot_yaml`."""
+    lines = [] if workspace is None else [f"  workspace: {{box_mm: {box_text(workspace)}}}"]
+    return lines if bed is None else [*lines, BED_COMMENT, f"  bed: {{z_mm: {in_mm(bed)}}}"]
+
+
+def _model_lines(models: Mapping[str, Sequence[str]]) -> list[str]:
+    """YAML of models and the model full."""
+    lines = [f"    {name}: [{', '.join(map(repr, globs))}]" for name, globs in models.items()]
+    return [*lines, "    full: complete"]
 
 
 def _gepetto_lines(letters: str, loops: Sequence[Loop]) -> list[str]:

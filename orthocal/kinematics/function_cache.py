@@ -138,7 +138,7 @@ def fingerprint(robot: Robot) -> str:
         robot.model.saveToString(),
         repr(robot.closures),
         repr(robot.drives),
-        repr(robot.tcp),
+        repr((robot.tcp, robot.bed)),
         repr(
             [
                 (leg.name, leg.root, leg.tip, leg.root_driven, np.asarray(leg.axis).tolist())

@@ -21,6 +21,7 @@ from orthocal.kinematics.workspace import (
     coordinate_letters,
     cube_limits,
     describe_box,
+    find_below_bed,
     tool_at_zero,
 )
 from orthocal.robot.model import Robot, require_commanded_tool
@@ -115,12 +116,14 @@ def describe_unreachable_box(robot: Robot, box: Array) -> str:
 def _nominal_reach_check(robot: Robot) -> RequireReach:
     """Check of tool positions on the nominal machine.
 
-    Positions must be within the travel of the drives and away from singularities.
+    Positions must be within the travel of the drives, above a bed and away from singularities.
     """
     coordinates = list(require_commanded_tool(robot))
     sensitivity = ToolSensitivity(robot, free=[f"{d.name}.offset" for d in robot.drives])
 
     def require_reach(points: Array) -> None:
+        for failure in find_below_bed(robot, points).values():
+            raise failure
         drives, passive = nominal_closure(robot).reach(points)
         require_travel(robot, drives)
         jacobians = sensitivity(drives, passive=passive)[:, coordinates]

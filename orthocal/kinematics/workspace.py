@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
+from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
+from orthocal.kinematics.continuation import Failures, label_postures
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.units import MM
@@ -28,6 +30,9 @@ POINTS_PER_SIDE = 5
 
 CELLS_PER_SIDE = 12
 """Cells per side of the uniform grid from which percentiles are computed."""
+
+BED_SLACK = 1e-6
+"""Rounding error by which the tool may be below a bed, [m]."""
 
 FEWEST_ALIGNED = 4
 """Fewest points for which a rotation is removed; with fewer it would absorb most of the errors."""
@@ -297,6 +302,28 @@ def position_at_zero(robot: Robot) -> Array:
     """
     position = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)
     return np.asarray(np.round(position, 12) + 0.0)  # no rounding errors, no −0
+
+
+def find_below_bed(robot: Robot, points: Array, names: Sequence[str] | None = None) -> Failures:
+    """Rows of tool positions below the bed of the machine, with the reason; none without a bed.
+
+    Args:
+        robot: The robot.
+        points: Tool coordinates, shape (K, n_coordinates), [m].
+        names: Names of the postures, for messages; by default their numbers.
+    """
+    if robot.bed is None:
+        return {}
+    height = require_tcp(robot).coordinates.index(2)
+    lowest, labels = tool_at_zero(robot)[height] + robot.bed, label_postures(names, len(points))
+    return {
+        i: ClosureError(
+            f"moves the tool to z {points[i, height] / MM:.4g} mm, below the bed at "
+            f"{lowest / MM:.4g} mm",
+            posture=labels[i],
+        )
+        for i in np.flatnonzero(points[:, height] < lowest - BED_SLACK).tolist()
+    }
 
 
 def describe_box(box: Array, letters: str = "xyz") -> str:

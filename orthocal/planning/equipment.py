@@ -18,7 +18,7 @@ from orthocal.io.fields import read_only
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import find_below_bed, tool_at_zero
 from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.measurement.motion.approach import approach_steps, usual_approaches
 from orthocal.observation.conditions import (
@@ -229,7 +229,9 @@ def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
 
 
 def reachable(robot: Robot, points: Array) -> Mask:
-    """Mask of tool positions that the nominal machine reaches within its travel, shape (n,).
+    """Mask of tool positions that the nominal machine reaches, shape (n,).
+
+    They are within its travel and not below its bed.
 
     Args:
         robot: The robot.
@@ -239,17 +241,17 @@ def reachable(robot: Robot, points: Array) -> Mask:
 
 
 def _reach_points(robot: Robot, points: Array) -> tuple[Array, Mask]:
-    """Drive coordinates of tool positions, and the mask of those within the travel."""
+    """Drive coordinates of tool positions, and the mask of those that `reachable` accepts."""
     failures = Failures()
     drives = nominal_closure(robot).inverse(points, failures=failures)
     lower, upper = np.array([(d.lower, d.upper) for d in robot.drives]).T
     reached = np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
-    reached[list(failures)] = False
+    reached[[*failures, *find_below_bed(robot, points)]] = False
     return drives, reached
 
 
 def place_reachable(robot: Robot, points: Array, middle: Array) -> dict[str, Posture]:
-    """Postures of the tool positions that the nominal machine reaches within its travel, by name.
+    """Postures of the tool positions that `reachable` accepts, by name.
 
     Args:
         robot: The robot.

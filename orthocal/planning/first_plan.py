@@ -110,12 +110,14 @@ def first_equipment(robot: Robot, equipment: Equipment) -> Equipment:
     """Equipment with sections and postures in which the tip is clear of the hinges.
 
     Raises:
-        RobotError: If the tool reaches less than MIN_REACH to a side of the mechanical zero.
+        RobotError: If the tool reaches less than MIN_REACH to a side of the mechanical zero where
+            no bed is.
     """
     box = choose_box(robot, equipment.box)
     middle = tool_at_zero(robot)
     low, high = (box - middle[:, None]).T
-    if low.max() > -MIN_REACH or high.min() < MIN_REACH:
+    on_bed = np.array([c == 2 and robot.bed is not None for c in require_tcp(robot).coordinates])
+    if low[~on_bed].max() > -MIN_REACH or high.min() < MIN_REACH:
         reach = " × ".join(f"{a / MM:g} … {b / MM:g}" for a, b in box)
         raise RobotError(
             f"the tool reaches {reach} mm; expected at least {MIN_REACH / MM:g} mm to either side "
@@ -164,8 +166,9 @@ def paper_plan(robot: Robot, equipment: Equipment) -> Session:
 def bed_plan(robot: Robot, equipment: Equipment) -> Session:
     """Plan with a dial at the tool over the bed, if readings at the legs do not determine offsets.
 
-    The tool moves on a square grid in the lowest plane of the workspace and approaches the bed from
-    above, because its drive coordinates grow upwards. The setup begins and ends in one posture.
+    The tool moves on a square grid on the bed, without one in the lowest plane of the workspace. It
+    approaches the bed from above, because its drive coordinates grow upwards. The setup begins and
+    ends in one posture.
 
     Args:
         robot: The robot, with a tool that moves along x, y and z.
@@ -180,7 +183,8 @@ def bed_plan(robot: Robot, equipment: Equipment) -> Session:
         for low, high in box[:2]
     )
     grid = [(x, y) for i, y in enumerate(rows) for x in columns[:: (-1) ** i] if x or y]
-    points = np.array([(x, y, box[2, 0]) for x, y in ((0.0, 0.0), *grid)])
+    height = box[2, 0] if robot.bed is None else robot.bed
+    points = np.array([(x, y, height) for x, y in ((0.0, 0.0), *grid)])
     points = (points + middle).round(9) + 0.0
     names = [posture_name(robot, p, middle) for p in points]
     length = float(np.ptp(box[:2], axis=1).max())

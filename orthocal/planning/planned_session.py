@@ -15,6 +15,7 @@ from orthocal.measurement.motion.motion import state_path_approaches
 from orthocal.planning.candidates import Candidates
 from orthocal.planning.selection import PlannedSetup
 from orthocal.planning.tool_candidates import PLACE
+from orthocal.sensors.protocol import tool_path
 from orthocal.session.points import base_name, names_in_files
 from orthocal.session.session import Posture, Reading, Session, Setup
 
@@ -39,7 +40,7 @@ def build_session(
             unusable = {
                 (base_name(r.setup), r.posture)
                 for r in plan.readings
-                if r.conditions is not None and "u" in (r.conditions.approach or "")
+                if tool_path(plan.setups[r.setup].sensor) is not None and "u" in (r.approach or "")
             }
         except UnreachablePathError as e:
             plan, unusable = e, {(base_name(e.setup), e.posture)}

@@ -16,13 +16,24 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.kinematics.tool_rotation import place_turning
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
-from orthocal.measurement.motion.approach import possible_approaches
+from orthocal.measurement.motion.approach import (
+    name_approach,
+    possible_approaches,
+    probing_starts,
+)
 from orthocal.planning.equipment import choose_box, place_reachable, posture_name
 from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import Sensor, default_zero, place_point, tool_path
+from orthocal.sensors.protocol import (
+    Sensor,
+    Triple,
+    default_zero,
+    place_point,
+    probing_direction,
+    tool_path,
+)
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import names_in_files, split_setup
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Setup
@@ -205,13 +216,31 @@ class _Positions:
     ) -> Iterator[tuple[str, Conditions | None]]:
         """Postures with each approach that effects of the machine distinguish.
 
-        For a sensor that prescribes the tool path, the approaches follow from the complete plan.
+        For a sensor that prescribes the tool path, the approaches follow from the complete plan. A
+        probe approaches each posture towards its surface.
         """
+        direction = probing_direction(sensor)
+        if direction is not None:
+            yield from self._probed(names, direction)
+            return
         if not self.by_approach or tool_path(sensor) is not None:
             yield from ((name, None) for name in names)
             return
         for approach, possible in self.by_approach.items():
             yield from ((name, Conditions(approach)) for name in names if name in possible)
+
+    def _probed(
+        self, names: Sequence[str], direction: Triple
+    ) -> Iterator[tuple[str, Conditions | None]]:
+        """Postures that can be probed, with the approach of the motion towards the surface."""
+        points = np.array([self.postures[name].values for name in names])
+        starts = probing_starts(self.robot, points, direction)
+        reached = place_reachable(self.robot, starts, self.middle)
+        for name, start in zip(names, starts, strict=True):
+            begin = reached.get(posture_name(self.robot, start, self.middle))
+            if begin is not None:
+                motion = self.postures[name].drives - begin.drives
+                yield name, Conditions(name_approach(motion))
 
 
 def segment_distances(start: Array, end: Array, other_start: Array, other_end: Array) -> Array:

@@ -132,6 +132,14 @@ class WorkspaceKeys(Keys):
     """Limits of the box."""
 
 
+class BedKeys(Keys):
+    """Horizontal surface under the tool."""
+
+    z_mm: Annotated[Number, Field(ge=-LARGEST_WORKSPACE_MM, le=0.0)]
+    """Lowest coordinate z of the tool centre point, relative to the mechanical zero: no plan and no
+    program moves the tool below it."""
+
+
 def _require_rising(limits: list[float]) -> list[float]:
     """Require that the first of two numbers is not the larger one."""
     low, high = limits
@@ -181,6 +189,7 @@ class OrthocalKeys(Keys):
     """Legs by name."""
     tcp: TcpKeys | None = None
     workspace: WorkspaceKeys | None = None
+    bed: BedKeys | None = None
     use: UseKeys = UseKeys()
     parameters: Annotated[
         dict[Name, Annotated[list[Name], Field(min_length=1)]], Field(max_length=MOST_PARTS)

@@ -184,6 +184,7 @@ def _build_robot(
         legs={},
         tcp=_build_tcp(model, keys, where),
         workspace=_read_workspace(keys, where),
+        bed=_read_bed(keys, where),
         use=_read_use(keys, where),
         declared=DeclaredErrors(
             tolerances=keys.orthocal.tolerances,
@@ -324,6 +325,31 @@ def _read_workspace(keys: RobotKeys, where: str) -> Array | None:
             where=f"{where}: orthocal.workspace.box_mm",
         )
     return read_only(np.array(workspace.box_mm) * MM)
+
+
+def _read_bed(keys: RobotKeys, where: str) -> float | None:
+    """Lowest coordinate z of the tool relative to the mechanical zero, [m]; None without a bed."""
+    tcp, workspace, bed = keys.orthocal.tcp, keys.orthocal.workspace, keys.orthocal.bed
+    if bed is None:
+        return None
+    if tcp is None or "z" not in tcp.coordinates:
+        raise RobotError(
+            "needs a tool that moves along z; expected z among the coordinates of orthocal.tcp",
+            where=f"{where}: orthocal.bed",
+        )
+    if workspace is None:
+        raise RobotError(
+            "needs orthocal.workspace, because the default one extends below the mechanical zero",
+            where=f"{where}: orthocal.bed",
+        )
+    lowest = workspace.box_mm[sorted(set(tcp.coordinates)).index("z")][0]
+    if lowest < bed.z_mm:
+        raise RobotError(
+            f"begins at z {lowest:g} mm, below the bed; expected at least {bed.z_mm:g} mm, as "
+            "orthocal.bed states",
+            where=f"{where}: orthocal.workspace.box_mm",
+        )
+    return bed.z_mm * MM
 
 
 def _read_use(keys: RobotKeys, where: str) -> Use:

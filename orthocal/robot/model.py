@@ -231,6 +231,9 @@ class Robot:
     workspace: Array | None
     """Box in the YAML over which tool errors are reported, relative to the mechanical zero, shape
     (n_coordinates, 2), [m]; None without one."""
+    bed: float | None
+    """Lowest coordinate z of the tool centre point, relative to the mechanical zero, [m]; None for
+    a machine without a bed."""
     use: Use
     """Conditions under which the machine is used."""
     declared: DeclaredErrors

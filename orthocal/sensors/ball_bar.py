@@ -172,7 +172,9 @@ class BallBar(ToolSensor):
             "every reading of this setup with the opposite sign.",
         )
 
-    def path(self, start: Array, end: Array, normal: Array | None = None) -> Array:
+    def path(
+        self, start: Array, end: Array, normal: Array | None = None, *, above: bool = False
+    ) -> Array:
         """Corners of a path on which the bar keeps its length: an arc about the fixed ball.
 
         Args:
@@ -180,6 +182,8 @@ class BallBar(ToolSensor):
             end: Last tool centre point, shape (3,), [m].
             normal: Unit normal of the plane in which the tool moves, shape (3,); None for a tool
                 that moves in space, along a great arc.
+            above: Whether the path must not be lower than its lower end. Azimuth and elevation then
+                change evenly.
 
         Returns:
             Tool centre points, shape (n, 3), [m]. Chords deviate from the arc by at most `SAGITTA`.
@@ -191,16 +195,31 @@ class BallBar(ToolSensor):
             ends, offset = ends - height, offset - height
         radii = np.linalg.norm(ends, axis=1)
         first, last = ends / np.maximum(radii, 1e-12)[:, None]
-        across = last - (first @ last) * first
-        if np.linalg.norm(across) < 1e-9:  # equal or opposite directions
-            across = np.linalg.svd(first[None])[2][-1]
-            if normal is not None:
-                across = np.cross(normal, first)
-        across /= np.linalg.norm(across)
-        angle = np.arctan2(abs(last @ across), first @ last)  # rounding may be negative
         step = 2.0 * np.arccos(1.0 - min(SAGITTA / radii.max(), 1.0))
-        share = np.linspace(0.0, 1.0, max(math.ceil(angle / step), 1) + 1)[:, None]
-        unit = np.cos(share * angle) * first + np.sin(share * angle) * across
+
+        def shares(angle: float) -> Array:
+            return np.linspace(0.0, 1.0, max(math.ceil(angle / step), 1) + 1)[:, None]
+
+        if above:
+            polar = np.array([[np.arctan2(y, x), np.arcsin(z)] for x, y, z in (first, last)])
+            motion = polar[1] - polar[0]
+            motion[0] = math.remainder(motion[0], 2.0 * np.pi)
+            share = shares(float(np.linalg.norm(motion)))
+            azimuth, elevation = (polar[0] + share * motion).T
+            level = np.cos(elevation)
+            unit = np.stack(
+                [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1
+            )
+        else:
+            across = last - (first @ last) * first
+            if np.linalg.norm(across) < 1e-9:  # equal or opposite directions
+                across = np.linalg.svd(first[None])[2][-1]
+                if normal is not None:
+                    across = np.cross(normal, first)
+            across /= np.linalg.norm(across)
+            angle = np.arctan2(abs(last @ across), first @ last)  # rounding may be negative
+            share = shares(angle)
+            unit = np.cos(share * angle) * first + np.sin(share * angle) * across
         return np.asarray((radii[0] + share * (radii[1] - radii[0])) * unit - offset)
 
     def constants(self, robot: Robot) -> Array:

@@ -1,8 +1,9 @@
-"""Touch probe or nozzle on a bed: drive coordinates at the trigger.
+"""Touch probe or nozzle on a bed: height of the tip above the surface.
 
-Each posture consists of the drive coordinates at which the probe triggered. Its reading is the
-height of the surface there, usually 0. The surface is a plane of unknown tilt, with or without a
-smooth deviation from flat. Heights are positive against the direction of the probe:
+A reading is the height of the tip above the surface in its posture. In a plan it is the coordinate
+of the posture minus that at the trigger. If the posture consists of the drive coordinates at the
+trigger, as in a printer's log, the reading is 0. The surface is a plane of unknown tilt, with or
+without a smooth deviation from flat. Heights are positive against the direction of the probe:
 
     h = −(n · q)/(n · u) − f(q) − o
 
@@ -19,7 +20,16 @@ from pydantic import Field
 
 from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View, triple
+from orthocal.sensors.direction import direction_vector
+from orthocal.sensors.protocol import (
+    PROBING_DISTANCE,
+    GaugeZero,
+    NuisanceParameter,
+    SetupKeys,
+    Triple,
+    View,
+    triple,
+)
 from orthocal.sensors.tool_indicator import (
     ALIGNMENT_STD,
     LENGTH_MM,
@@ -112,10 +122,21 @@ class Probe(ToolIndicator):
     @property
     def mounting_steps(self) -> tuple[str, ...]:
         """Instructions for the operator."""
+        axis, posture, trigger = self.direction[-1], "that of the posture", "that at the trigger"
+        first, second = (posture, trigger) if self.direction.startswith("-") else (trigger, posture)
         return (
-            f"Move the probe towards {self.direction} in each posture until it triggers. Write the "
-            "coordinates at the trigger as the posture, and 0 as the reading.",
+            f"At each posture begin {PROBING_DISTANCE / MM:g} mm before the surface. Move the "
+            f"probe slowly towards {self.direction} until it triggers, note the coordinate {axis} "
+            "of the tool, and move back.",
+            "The reading is the height of the tip above the surface in the posture: the coordinate "
+            f"{axis}, {first} minus {second}. It is negative if the probe triggers before the "
+            "posture.",
         )
+
+    @property
+    def probing(self) -> Triple:
+        """Direction of the probe, a unit vector."""
+        return triple(direction_vector(self.direction))
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:

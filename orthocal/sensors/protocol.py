@@ -35,10 +35,15 @@ readings are absolute."""
 ToolPath = Callable[..., Array]
 """Function from two tool positions, shape (3,), [m], to the corners of the path between them, with
 both ends, shape (n, 3), [m]. For a tool that moves in a plane it has a third argument: the unit
-normal of the plane, shape (3,)."""
+normal of the plane, shape (3,). On a machine with a bed it has a keyword `above`: True for a path
+that is nowhere lower than its lower end."""
 
 DIMENSION_STEP = 1e-6
 """Increment of a dimension for the derivative of readings with respect to it, [m]."""
+
+PROBING_DISTANCE = 10e-3
+"""Distance from a posture at which a probe begins to move towards the surface, [m]; larger than
+usual errors of a machine before the calibration."""
 
 LARGEST_READING = 0.3
 """Largest reading of an indicator, [m]; no leg is as far from parallel."""
@@ -179,6 +184,9 @@ class Sensor(Protocol):
 
     # path: ToolPath, optional: path of the tool between two readings; straight by default
     # (`tool_path`)
+
+    # probing: Triple, optional: direction, a unit vector, in which the tool moves in each posture
+    # until the sensor triggers (`probing_direction`)
 
     # mounting_steps: tuple[str, ...], optional: instructions for mounting the sensor in the
     # alignment posture (`mounting_steps`)
@@ -324,6 +332,11 @@ def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:
 def tool_path(sensor: Sensor) -> ToolPath | None:
     """Path of the tool that a sensor prescribes; None for a straight one."""
     return _optional(sensor, "path", None)
+
+
+def probing_direction(sensor: Sensor) -> Triple | None:
+    """Direction in which the tool moves until a sensor triggers; None for other sensors."""
+    return _optional(sensor, "probing", None)
 
 
 def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:

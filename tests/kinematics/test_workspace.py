@@ -7,6 +7,7 @@ import pytest
 
 from orthocal import load_robot
 from orthocal.builder.build import make_robot
+from orthocal.builder.linear_delta import LinearDelta
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics.loop_closure import nominal_closure
@@ -110,4 +111,29 @@ def test_an_invalid_workspace_is_named_by_file_and_key(tmp_path, box, message):
     with pytest.raises(RobotError) as e:
         load_robot(yaml.parent)
     assert str(yaml) in str(e.value)
+    assert message in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"z_mm: 0": "z_mm: 5"}, "orthocal.bed.z_mm"),
+        ({"[0, 140]]": "[-10, 140]]"}, "begins at z -10 mm, below the bed; expected at least 0 mm"),
+        ({"  workspace: ": "  # "}, "orthocal.bed: needs orthocal.workspace"),
+        ({", z]": "]", ", [0, 140]]": "]"}, "orthocal.bed: needs a tool that moves along z"),
+    ],
+)
+def test_an_impossible_bed_is_named_by_file_and_key(tmp_path, changes, message):
+    (tmp_path / "mine").mkdir()
+    machine = LinearDelta()
+    (tmp_path / "mine/mine.urdf").write_text(machine.urdf("mine"))
+    text = machine.yaml()
+    (tmp_path / "mine/mine.yaml").write_text(text)
+    assert load_robot(tmp_path / "mine").bed == 0.0
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "mine/mine.yaml").write_text(text)
+    with pytest.raises(RobotError) as e:
+        load_robot(tmp_path / "mine")
     assert message in str(e.value)

@@ -36,7 +36,7 @@ from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.motion.motion import plan_motion
-from orthocal.measurement.motion.motion_program import write_program
+from orthocal.measurement.motion.motion_program import ProgramOptions, write_program
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.sheet.page import sheet_files
@@ -44,7 +44,7 @@ from orthocal.output.text.plan import describe_absent, plan_json
 from orthocal.planning import plan as planning
 from orthocal.planning import planned_session, tool_candidates
 from orthocal.planning.candidates import list_candidates, measure_candidates
-from orthocal.planning.equipment import Equipment, equipment_of, place_tool
+from orthocal.planning.equipment import Equipment, choose_box, equipment_of, place_tool
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.first_plan import paper_plan
 from orthocal.planning.owned_sensors import load_owned_sensor
@@ -54,7 +54,7 @@ from orthocal.planning.tool_candidates import list_tool_candidates, segment_dist
 from orthocal.sensors.ball_bar import SAGITTA, BallBar
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import names_in_files
-from orthocal.session.session import Gauge, Reading, Session, Setup
+from orthocal.session.session import Conditions, Gauge, Reading, Session, Setup
 
 BAR = """sensor: ball_bar
 sigma_mm: 0.002
@@ -351,6 +351,69 @@ def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
     assert list(setups) == ["probe"]
     assert len(readings) > 100
     assert {p.values[2] for p in postures.values()} == {0.02}
+
+
+def lowest(files):
+    """Lowest height of the motions of all programs, [mm]."""
+    return min(
+        float(z) for text in files.values() for z in re.findall(r"(?m)^G53 .* Z(.*) F", text)
+    )
+
+
+@pytest.mark.parametrize("effects", [(), ("backlash",)])
+def test_a_bed_is_probed_from_above(owned, effects):
+    """The operator probes from 10 mm above. The tool moves back before the next posture."""
+    robot = replace(with_effects(load_robot("linear_delta"), effects), legs={})
+    equipment = Equipment(owned=owned(probe=PROBE))
+    with uncompared(), few_machines():
+        session = plan_readings(robot, "offsets", hours=0.1, equipment=equipment, starts=1).session
+    assert {r.approach for r in session.readings} == {"nnn"}
+    program = sheet_files(session, options=ProgramOptions(dwell=1.0))["01-probe.ngc"]
+    assert lowest({"": program}) == 10.0
+    assert program.count("\nM0\n") == len(session.readings)
+    assert "G4 " not in program
+    (motion,) = plan_motion(session)
+    for before, stop in itertools.pairwise(motion.stops):
+        assert np.array_equal(stop.via, [before.approach_point])
+        assert stop.approach_point - stop.point == pytest.approx([0.0, 0.0, 0.01])
+    lower = replace(session, postures={n: lowered(robot, p) for n, p in session.postures.items()})
+    assert lowest(sheet_files(lower)) == 9.0  # as in a log, whose postures are the triggers
+    stated = replace(session.readings[0], conditions=Conditions("ppp"))
+    with pytest.raises(SessionError, match="probes towards its surface"):
+        plan_motion(replace(session, readings=(stated, *session.readings[1:])))
+
+
+def lowered(robot, posture):
+    """Posture 1 mm below another one."""
+    (placed,) = place_tool(robot, [posture.name], posture.values[None] - [0.0, 0.0, 1e-3]).values()
+    return placed
+
+
+@pytest.mark.parametrize("box", [None, np.array([[-0.06, 0.06]] * 3)])
+def test_plans_of_a_machine_with_a_bed_stay_above_it(owned, box):
+    """Postures, approaches and paths of gauges at the rods and of a ball bar."""
+    robot = with_effects(load_robot("linear_delta"), ("backlash",))
+    equipment = Equipment(owned=owned(bar=BAR), box=box, along=4, sections=(0.5,))
+    listed = list_candidates(robot, equipment)
+    of_rods = {r.posture for r in listed.readings if r.setup[0] != "b"}
+    at_bed = {n for n, p in listed.postures.items() if p.values[2] == 0.0}
+    assert min(p.values[2] for p in listed.postures.values()) == 0.0
+    assert {r.approach for r in listed.readings if r.posture in at_bed & of_rods} == {"nnn"}
+    with few_balls(1), uncompared(), few_machines():
+        plan = plan_readings(robot, "offsets", hours=1.0, equipment=equipment, starts=1).session
+    assert {s.gauge for s in plan.setups.values()} == {"dial", "bar"}
+    assert lowest(sheet_files(plan)) >= 0.0
+    below = replace(plan, postures={n: lowered(robot, p) for n, p in plan.postures.items()})
+    if min(p.values[2] for p in below.postures.values()) < 0.0:
+        with pytest.raises((SessionError, UnreachablePathError), match="below the bed"):
+            plan_motion(below)
+
+
+def test_a_machine_without_a_bed_may_move_below_its_zero():
+    robot = load_robot("linear_delta")
+    assert choose_box(robot, None)[2].tolist() == [0.0, 0.1]
+    assert choose_box(replace(robot, bed=-0.025), None)[2].tolist() == [-0.02, 0.1]
+    assert choose_box(replace(robot, bed=None), None)[2].tolist() == [-0.1, 0.1]
 
 
 @pytest.fixture(scope="module")

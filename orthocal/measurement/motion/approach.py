@@ -18,7 +18,9 @@ from orthocal.kinematics.conditions import APPROACH as SIGN_OF_LETTER
 from orthocal.kinematics.conditions import ARROWS
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
-from orthocal.robot.model import Robot
+from orthocal.kinematics.workspace import find_below_bed
+from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.protocol import PROBING_DISTANCE, Triple
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
@@ -139,6 +141,21 @@ def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: floa
     return lengths * [SIGN_OF_LETTER[letter] or SIGN_OF_LETTER[other] for letter in approach]
 
 
+def probing_starts(robot: Robot, points: Array, direction: Triple) -> Array:
+    """Tool positions at which a probe begins to move towards the surface.
+
+    Args:
+        robot: The robot.
+        points: Commanded tool coordinates of the postures, shape (n, n_coordinates), [m].
+        direction: Direction of the probe, a unit vector.
+
+    Returns:
+        Shape (n, n_coordinates), [m].
+    """
+    along = np.array(direction)[list(require_tcp(robot).coordinates)]
+    return np.asarray(points - PROBING_DISTANCE * along)
+
+
 def possible_approaches(robot: Robot, postures: Mapping[str, Posture]) -> dict[str, frozenset[str]]:
     """Usual approaches, mapped to the names of the postures that allow them."""
     names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
@@ -183,7 +200,7 @@ def state_common_approach(session: Session) -> Session:
 
 
 def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:
-    """Mask of the postures whose approach starts within reach of the machine, shape (n,).
+    """Mask of the postures whose approach starts within reach, and above a bed, shape (n,).
 
     Args:
         robot: The robot.
@@ -196,6 +213,10 @@ def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:
     possible[list(beyond_travel)] = False
     failures = Failures()
     inside = np.flatnonzero(possible)
-    nominal_closure(robot).close(start[inside], failures=failures)
+    closure = nominal_closure(robot)
+    passive = closure.close(start[inside], failures=failures)
     possible[inside[list(failures)]] = False
+    if robot.bed is not None:
+        tool = closure.tcp(start[inside], passive)[:, list(require_tcp(robot).coordinates)]
+        possible[inside[list(find_below_bed(robot, tool))]] = False
     return possible

@@ -4,8 +4,9 @@ A setup starts in its alignment posture, where the operator mounts and aligns th
 posture is approached as its reading states, by the last motion of each drive. If no reading states
 an approach, all postures are approached from one side. Then backlash has the same effect on all
 readings. Approaches follow from the path if the sensor prescribes it between its readings: the
-tool ball of a ball bar stays on a sphere. Each segment of the path is sampled to check three
-conditions: the drives reach it, the tip stays on the rod, and the dial stays in its range.
+tool ball of a ball bar stays on a sphere. A probe moves straight towards the surface, and back
+before the next posture. Each segment of the path is sampled to check four conditions: the drives
+reach it, it is not below a bed, the tip stays on the rod, and the dial stays in its range.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from orthocal.errors import ClosureError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
-from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
+from orthocal.kinematics.workspace import find_below_bed, position_at_zero, tool_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
     USUAL_LENGTH,
@@ -32,6 +33,7 @@ from orthocal.measurement.motion.approach import (
     approach_steps,
     fill_approach,
     name_approach,
+    probing_starts,
     usual_approaches,
 )
 from orthocal.measurement.motion.guidance import range_of_expected
@@ -46,6 +48,7 @@ from orthocal.sensors.protocol import (
     Triple,
     has_dial,
     instrument,
+    probing_direction,
     reads_pairs,
     tool_path,
 )
@@ -173,20 +176,24 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
     first = {setup: rows[0][1] for setup, rows in rows_by_setup.items()}
-    guided = _guided_setups(session)
+    guided, probed = _guided_setups(session), _probed_setups(session)
+    by_rule = {setup for setup in first if setup not in guided and setup not in probed}
     additional_alignments = {
         aligned_at[s]
         for s, r in first.items()
-        if s not in guided and aligned_at[s] != (r.minus or r.posture)
+        if s in by_rule and aligned_at[s] != (r.minus or r.posture)
     }
-    unguided = [r for r in session.readings if r.setup not in guided]
-    stop_at = _find_approaches(session, unguided, additional_alignments) if unguided else {}
+    readings = [r for r in session.readings if r.setup in by_rule]
+    stop_at = _find_approaches(session, readings, additional_alignments) if readings else {}
     motions = []
     for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
-        if setup in guided:
+        if setup not in by_rule:
             on_path = _stops_on_path(session, setup)
             listed = _list_stops(rows, aligned_at[setup], on_path, any_side=True)
-            stops = _follow_path(session, setup, listed, guided[setup])
+            if setup in guided:
+                stops = _follow_path(session, setup, listed, guided[setup])
+            else:
+                stops = _probe_stops(session, setup, listed, probed[setup])
         else:
             stops = _list_stops(rows, aligned_at[setup], stop_at)
             if session.robot.commands_tool:
@@ -215,13 +222,18 @@ def _refuse_pairs(session: Session) -> None:
 def state_path_approaches(session: Session) -> Session:
     """Session whose readings state the approaches that follow from the paths of their sensors.
 
-    The session is unchanged if no effect of the machine depends on the approach.
+    The session is unchanged if no effect of the machine depends on the approach. Then the paths
+    are still tested where the machine has a bed.
 
     Raises:
         SessionError: If there are too many readings, or a posture cannot be reached or approached.
     """
     guided = _guided_setups(session)
-    if not guided or not usual_approaches(session.robot):
+    if not guided:
+        return session
+    if not usual_approaches(session.robot):
+        if session.robot.bed is not None:
+            plan_motion(session.select([r for r in session.readings if r.setup in guided]))
         return session
     approaches = {
         (m.setup, stop.line): stop.approach
@@ -257,6 +269,17 @@ def _guided_setups(session: Session) -> dict[str, Path]:
     }
 
 
+def _probed_setups(session: Session) -> dict[str, Triple]:
+    """Directions of probes, by setup."""
+    if not session.robot.commands_tool:
+        return {}
+    return {
+        name: direction
+        for name, setup in session.setups.items()
+        if (direction := probing_direction(setup.sensor)) is not None
+    }
+
+
 def _in_coordinates(robot: Robot, path: ToolPath, tool: Triple) -> Path:
     """Path between coordinates that the drives control: in space, or in the plane of motion.
 
@@ -274,7 +297,10 @@ def _in_coordinates(robot: Robot, path: ToolPath, tool: Triple) -> Path:
         ends = np.array([fixed, fixed])
         on_path = np.array([start, end])
         ends[:, coordinates] = on_path + rotation_shift(robot, on_path, tool)
-        return place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
+        corners = place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
+        if find_below_bed(robot, corners) and not find_below_bed(robot, on_path):
+            corners = place_turning(robot, path(*ends, *normal, above=True)[:, coordinates], tool)
+        return corners
 
     return between
 
@@ -357,7 +383,7 @@ def _begin_approaches(
 
     Returns:
         Stops by place, and no errors; or no stops, and errors by place whose approach is out of
-        reach.
+        reach or below a bed.
     """
     robot, names = session.robot, [name for name, _ in places]
     closure, unknown = nominal_closure(robot), "u" * len(robot.drives)
@@ -368,14 +394,16 @@ def _begin_approaches(
     failures = find_beyond_travel(robot, drives, names)
     if not failures:
         passive = closure.close(drives, names=names, failures=failures)
-    if failures:
-        return {}, {places[i]: error for i, error in failures.items()}
     ends: Sequence[Array | None] = [None] * len(names)
     starts = ends
-    if robot.commands_tool and robot.tcp is not None:
+    if not failures and robot.commands_tool and robot.tcp is not None:
         coordinates = list(robot.tcp.coordinates)
         ends = list(closure.forward(nominal, names=names)[:, coordinates])
         starts = list(closure.tcp(drives, passive)[:, coordinates])
+        for points in (ends, starts):
+            failures |= find_below_bed(robot, np.array(points), names)
+    if failures:
+        return {}, {places[i]: error for i, error in failures.items()}
     approaches = [fill_approach(robot, stated, letter) for _, stated in places]
     columns = zip(places, names, approaches, nominal, drives, ends, starts, strict=True)
     return {
@@ -476,6 +504,47 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     return _predict(session, setup, checked, _require_paths(session, setup, checked, paths))
 
 
+def _probe_stops(
+    session: Session, setup: str, stops: Sequence[Stop], direction: Triple
+) -> list[Stop]:
+    """Stops of a probe, approached towards its surface, with their predicted readings.
+
+    The tool moves back before it moves to the next posture. The posture may be below a bed: the
+    surface stops the probe, and programs stop where the probing begins.
+
+    Raises:
+        SessionError: If a path leaves the workspace, or a reading states another approach.
+    """
+    robot = session.robot
+    points = np.array([stop.point for stop in stops])
+    starts = probing_starts(robot, points, direction)
+    polylines = [[tool_at_zero(robot), starts[0], points[0]]]
+    polylines += [
+        [points[i], starts[i], *ends]
+        for i, ends in enumerate(zip(starts[1:], points[1:], strict=True))
+    ]
+    sampled = _sample_paths(robot, polylines, probing=True)
+    paths, checked = _require_paths(session, setup, stops, sampled), list[Stop]()
+    drives = nominal_closure(robot).inverse(starts, names=[stop.posture for stop in stops])
+    for i, (stop, begin) in enumerate(zip(stops, drives, strict=True)):
+        approach = name_approach(stop.drives - begin)
+        if not _agree(stop.approach, approach):
+            raise SessionError(
+                f"cannot be approached as stated ({stop.approach}): setup '{setup}' probes towards "
+                f"its surface, and the drives arrive with {approach}",
+                where=f"{session.path or 'session'}: postures.{stop.posture}",
+            )
+        via = () if i == 0 else (starts[i - 1],)
+        end = {"approach": approach, "approach_drives": begin, "approach_point": starts[i]}
+        checked.append(replace(stop, via=via, **end))
+    return _predict(session, setup, checked, paths)
+
+
+def _agree(stated: str, approach: str) -> bool:
+    """True if no drive has two opposite directions in two approaches."""
+    return all(a == b or "u" in (a, b) for a, b in zip(stated, approach, strict=True))
+
+
 def _require_paths(
     session: Session,
     setup: str,
@@ -488,11 +557,12 @@ def _require_paths(
     Raises:
         UnreachablePathError: If a path leaves the workspace; names the posture.
     """
+    below = "" if session.robot.bed is None else " or goes below the bed"
     for stop, path in zip(stops, paths, strict=True):
         if path is None:
             raise UnreachablePathError(
                 f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace"
-                f"{remark}",
+                f"{below}{remark}",
                 setup=setup,
                 posture=stop.posture,
                 where=str(session.path or "session"),
@@ -524,7 +594,7 @@ def _arrive(
         drives = closure.inverse(begin[None])[0]
         approach = name_approach(stop.drives - drives)
         approaches.append(approach)
-        if all(a == b or "u" in (a, b) for a, b in zip(stop.approach, approach, strict=True)):
+        if _agree(stop.approach, approach):
             break
     else:
         raise SessionError(
@@ -556,8 +626,16 @@ def _walk(corners: Array, length: float) -> Array:
     return np.asarray(corners[-1])
 
 
-def _sample_paths(robot: Robot, polylines: Sequence[Sequence[Array]]) -> list[_Path | None]:
-    """Samples of polylines of tool coordinates; None if the machine does not reach all of one."""
+def _sample_paths(
+    robot: Robot, polylines: Sequence[Sequence[Array]], *, probing: bool = False
+) -> list[_Path | None]:
+    """Samples of polylines of tool coordinates; None if the machine does not reach all of one.
+
+    Args:
+        robot: The robot.
+        polylines: Corners of each, shape (n_coordinates,) each, [m].
+        probing: Whether a surface stops the last motion of each. Both ends may be below a bed.
+    """
     sampled = [_sample(corners) for corners in polylines]
     closure, points, failures = nominal_closure(robot), np.concatenate(sampled), Failures()
     try:
@@ -565,11 +643,12 @@ def _sample_paths(robot: Robot, polylines: Sequence[Sequence[Array]]) -> list[_P
     except ClosureError:
         drives, passive = closure.reach(points, failures=failures)
     paths, first = list[_Path | None](), 0
-    for part in sampled:
+    for part, corners in zip(sampled, polylines, strict=True):
         last = first + len(part)
         path = _Path(part, drives[first:last], passive[first:last])
         reached = failures.keys().isdisjoint(range(first, last))
-        if reached and find_beyond_travel(robot, path.drives):
+        moved = corners[1:-1] if probing else corners
+        if find_beyond_travel(robot, path.drives) or find_below_bed(robot, np.array(moved)):
             reached = False
         paths.append(path if reached else None)
         first = last
@@ -618,10 +697,10 @@ def _predict(
         predicted = predicted - predicted[ends[first] - 1]
         if not differences:
             predicted += gauge.middle
-    finished = []
+    finished, probed = [], probing_direction(session.setups[setup].sensor) is not None
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
-        if i > 0:  # the gauge is mounted at the first stop
+        if i > 0 and not probed:  # the gauge is mounted at the first stop; a probe touches nothing
             start = end - len(paths[i].points)
             on_path = predicted[start:end]
             problems = [p for p in contact.problems[start:end] if p]

@@ -5,6 +5,7 @@ posture, where the operator mounts and aligns the gauge. A pause for each readin
 logger, a program dwells and triggers it instead. It still pauses where the operator sets the dial
 or holds the plunger up. The fixed ball of a ball bar may be in the way of the first motion. So its
 program also pauses before this motion, and starts in the first posture if the ball stays mounted.
+With a probe it pauses above each posture, where the operator probes.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -14,7 +15,7 @@ joints.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from orthocal.measurement.motion.motion import SetupMotion, Stop
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import BallIndicator
-from orthocal.sensors.protocol import Sensor, mounting_steps
+from orthocal.sensors.protocol import Sensor, mounting_steps, probing_direction
 from orthocal.session.session import Session
 from orthocal.text import comment_safe, shorten
 from orthocal.units import MM, format_fixed
@@ -146,13 +147,17 @@ def write_program(
             "the drives do not command the tool: there are no coordinates for a program",
             where=str(robot.yaml),
         )
-    name, setup = (comment_safe(text, LONGEST_NAME) for text in (robot.name, motion.setup))
     of_setup = session.setups[motion.setup]
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
+    read, probed = "read", probing_direction(sensor) is not None
+    if probed:  # by the operator
+        read = "probe, note the trigger, move back"
+        options = replace(options, dwell=None, trigger=None)
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     stated = any(r.approach for r in session.readings)
     lines = [
-        f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
+        f"(orthocal: {comment_safe(robot.name, LONGEST_NAME)}, setup "
+        f"{comment_safe(motion.setup, LONGEST_NAME)}, {motion.number} of {motion.count})",
         f"({comment_safe(sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(session, tool_at_zero(robot))})",
@@ -169,21 +174,18 @@ def write_program(
         zero = "0" if stop.role == "subtracted" else ""
         if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
             zero = dial_zero(gauge)
-        actions = (
-            mount if i == 0 else "",
-            f"set the dial to {zero}" if zero else "",
-            "read" if stop.role == "reading" else "",
-        )
-        instruction = ", then ".join(action for action in actions if action)
+        setting = f"set the dial to {zero}" if zero else ""
+        actions = mount * (i == 0), setting, read * (stop.role == "reading")
+        instruction = ", then ".join(filter(None, actions))
         instruction = "; ".join(filter(None, (instruction, motion.closing(stop, sensor))))
-        signs = describe_approach(robot, stop.approach).translate(SIGNS)
-        side = f"; approach {signs}" if stated else ""
-        lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
-        lines += _moves(session, stop, options)
-        lines.append(f"(MSG, {_label(stop)}: {instruction})")
+        side = "; approach " + describe_approach(robot, stop.approach).translate(SIGNS)
+        lines += [
+            f"({_label(stop)}{side if stated else ''}; joints {_joints(robot, stop)})",
+            *_moves(session, stop, options, probed=probed),
+            f"(MSG, {_label(stop)}: {instruction})",
+        ]
         following = stops[i + 1] if i + 1 < len(stops) else None
-        needs_hand = i == 0 or bool(zero or stop.lift)
-        lines += _read(stop, following, options, needs_hand=needs_hand)
+        lines += _read(stop, following, options, needs_hand=bool(i == 0 or zero or stop.lift))
     return "\n".join([*lines, f"(MSG, end: {_end(sensor)})", "M2", ""])
 
 
@@ -259,10 +261,12 @@ def _read(
     return [*lines, *hold, "M0"] if hold else lines
 
 
-def _moves(session: Session, stop: Stop, options: ProgramOptions) -> list[str]:
-    """Motion to the start of the approach, and the approach."""
+def _moves(session: Session, stop: Stop, options: ProgramOptions, *, probed: bool) -> list[str]:
+    """Motion to the start of the approach, and the approach unless the operator probes."""
     targets: list[tuple[Array | None, float]] = [(point, options.feed) for point in stop.via]
-    targets += [(stop.approach_point, options.feed), (stop.point, options.approach_feed)]
+    targets.append((stop.approach_point, options.feed))
+    if not probed:  # the operator moves a probe until it triggers
+        targets.append((stop.point, options.approach_feed))
     return [f"G53 G1 {_words(session, point)} F{feed:g}" for point, feed in targets]
 
 

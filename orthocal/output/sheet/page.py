@@ -36,7 +36,13 @@ from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import PARALLEL_SINE, Robot, drive_keys, name_coordinates
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
-from orthocal.sensors.protocol import has_dial, mounting_steps, tool_path
+from orthocal.sensors.protocol import (
+    PROBING_DISTANCE,
+    has_dial,
+    mounting_steps,
+    probing_direction,
+    tool_path,
+)
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Gauge, Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
@@ -78,6 +84,12 @@ BALL_IN_THE_WAY = (
     "Remove them before you start the program of another gauge."
 )
 """Rule for programs of a session with a ball bar."""
+
+PROBING = (
+    "A probe reaches each posture by the motion towards its surface. The programs stop "
+    f"{PROBING_DISTANCE / MM:g} mm before each posture, and you probe."
+)
+"""Rule for the approach of postures that are probed."""
 
 BY_EYE = 0.01
 """Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
@@ -575,26 +587,32 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     """Rule for the last motion to a posture, in joint numbers."""
     robot, length = session.robot, approach_length(session)
     guided = [n for n, s in session.setups.items() if tool_path(s.sensor) is not None]
-    arcs = ""
-    if guided and not any(r.approach for r in session.readings):  # the table has no arrows
+    probed = [n for n, s in session.setups.items() if probing_direction(s.sensor) is not None]
+    motions = [m for m in motions if m.setup not in probed]
+    others = [PROBING] if probed else []
+    if guided and not any(r.approach for r in session.readings if r.setup in guided):
         motions = [m for m in motions if m.setup not in guided]
-        arcs = "Around a fixed ball the programs move along arcs. If you jog, stay near the sphere."
+        others.append(
+            "Around a fixed ball the programs move along arcs. If you jog, stay near the sphere."
+        )
     if not motions:
-        return arcs
+        return " ".join(others)
     arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
     if len(arrows) > 1:
-        return (
+        rule = (
             f"{AS_ARROWS_SHOW.format(length)}{_order_of_arrows(robot, arrows)} The programs do "
             f"this. If you jog, first move each joint to a number {length} smaller (↑) or larger "
             "(↓) than that of the posture. Then move all joints to the posture, one after the "
             "other or together. If a joint went too far, begin the approach again."
         )
+        return " ".join([rule, *others])
     (arrow,) = arrows
-    return (
+    rule = (
         f"Approach every posture from the same side: in the last {length} "
         f"{_describe_arrow(robot, arrow)}. The programs do this. If you jog, begin {length} "
-        f"before the posture with every joint and move each joint to it in one motion. {arcs}"
-    ).rstrip()
+        f"before the posture with every joint and move each joint to it in one motion."
+    )
+    return " ".join([rule, *others])
 
 
 def _order_of_arrows(robot: Robot, arrows: Collection[str]) -> str:

@@ -93,8 +93,9 @@ HOW_TO = {
         "the machine by eye. It must not move until the setup is finished."
     ),
     Probe.kind: (
-        "Probe: move down in each posture until it triggers. Write the coordinates at the trigger "
-        "as the posture, and 0 as the reading."
+        "Probe: the programs stop above each posture. Move the probe towards the surface until it "
+        "triggers. A reading is the height of the tip above the surface in the posture: the "
+        "coordinate of the posture minus that at the trigger."
     ),
     Points.kind: (
         "Points: set up the instrument so that it sees the target in every posture, and fix the "
