@@ -145,10 +145,12 @@ def _require_same_machine(sessions: Sequence[Session]) -> None:
                 where=f"{session.path or 'session'}: calibration.effects",
             )
         if (session.firmware is None) != (last.firmware is None):
+            stating, other = (session, last) if last.firmware is None else (last, session)
             raise SessionError(
-                "states settings of a firmware, unlike another session; expected logs of one "
-                "printer",
-                where=f"{session.path or 'session'}: controller.firmware",
+                "is missing, but another session of this printer states it. If the firmware had "
+                "the same settings, copy the block controller of "
+                f"{stating.path or 'that session'} into this file",
+                where=f"{other.path or 'session'}: controller.firmware",
             )
         source = str(first.path or first.title or "another session")
         require_same_tolerances(first.robot, session, source=source)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,6 +15,7 @@ from orthocal.measurement.motion.motion import state_path_approaches
 from orthocal.planning.candidates import Candidates
 from orthocal.planning.selection import PlannedSetup
 from orthocal.planning.tool_candidates import PLACE
+from orthocal.printers.settings import DeltaSettings
 from orthocal.sensors.protocol import tool_path
 from orthocal.session.points import base_name, names_in_files
 from orthocal.session.session import Posture, Reading, Session, Setup
@@ -128,11 +129,23 @@ def _order_readings(
         plan,
         compensation=measured.compensation,
         controller_origin=measured.controller_origin,
+        firmware=measured.firmware,
+        postures=_commanded(plan.postures, measured.firmware),
         adjusted=measured.adjusted,
     )
     if measured.controller_offsets is not None:
         plan = plan.with_controller(measured.controller_offsets)
     return state_path_approaches(plan)
+
+
+def _commanded(
+    postures: Mapping[str, Posture], firmware: DeltaSettings | None
+) -> Mapping[str, Posture]:
+    """Postures with the drive coordinates to which a printer's firmware moves its carriages."""
+    if firmware is None:
+        return postures
+    drives = firmware.inverse([p.values for p in postures.values()])
+    return {n: Posture(n, "joints", d, d) for n, d in zip(postures, drives, strict=True)}
 
 
 def order_postures(points: Array) -> list[int]:

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
+from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.observations import drive_table
 from orthocal.robot.model import Robot
@@ -103,6 +105,34 @@ def set_dial(session: Session, setup: str) -> str:
         f"Set the gauge so that its plunger is pressed in by half of its travel{travel}. Then turn "
         f"the bezel until the dial shows {dial_zero(gauge)}."
     )
+
+
+def shown_tool(session: Session, points: Array) -> Array:
+    """Tool coordinates that the controller displays, shape (n, n_coordinates), [m].
+
+    The firmware of a printer computes them by its settings, which differ from the nominal machine.
+    They are without `controller_origin`.
+
+    Args:
+        session: The session.
+        points: Tool coordinates of the nominal machine, shape (n, n_coordinates), [m].
+    """
+    if session.firmware is None:
+        return points
+    # a point out of reach is refused elsewhere
+    drives = nominal_closure(session.robot).inverse(points, failures=Failures())
+    return session.firmware.forward(drives)
+
+
+def start_point(session: Session) -> Array:
+    """Tool coordinates of the nominal machine where programs start, shape (n_coordinates,), [m].
+
+    This is the mechanical zero; on a printer the position that its firmware displays as 0.
+    """
+    if session.firmware is None:
+        return tool_at_zero(session.robot)
+    drives = session.firmware.inverse(np.zeros(3))
+    return np.asarray(nominal_closure(session.robot).forward(drives)[0])
 
 
 def shown_joints(robot: Robot, drives: ArrayLike) -> Array:

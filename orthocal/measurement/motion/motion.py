@@ -24,7 +24,7 @@ from orthocal.errors import ClosureError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
-from orthocal.kinematics.workspace import find_below_bed, position_at_zero, tool_at_zero
+from orthocal.kinematics.workspace import find_below_bed, position_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
     USUAL_LENGTH,
@@ -36,11 +36,11 @@ from orthocal.measurement.motion.approach import (
     probing_starts,
     usual_approaches,
 )
-from orthocal.measurement.motion.guidance import range_of_expected
+from orthocal.measurement.motion.guidance import range_of_expected, shown_tool, start_point
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
-from orthocal.robot.model import Robot, require_tcp
+from orthocal.robot.model import require_tcp
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import (
     Sensor,
@@ -263,7 +263,7 @@ def _guided_setups(session: Session) -> dict[str, Path]:
     if not session.robot.commands_tool:
         return {}
     return {
-        name: _in_coordinates(session.robot, path, getattr(setup.sensor, "tool", (0.0, 0.0, 0.0)))
+        name: _in_coordinates(session, path, getattr(setup.sensor, "tool", (0.0, 0.0, 0.0)))
         for name, setup in session.setups.items()
         if (path := tool_path(setup.sensor)) is not None
     }
@@ -280,14 +280,15 @@ def _probed_setups(session: Session) -> dict[str, Triple]:
     }
 
 
-def _in_coordinates(robot: Robot, path: ToolPath, tool: Triple) -> Path:
+def _in_coordinates(session: Session, path: ToolPath, tool: Triple) -> Path:
     """Path between coordinates that the drives control: in space, or in the plane of motion.
 
     Args:
-        robot: The robot.
+        session: The session.
         path: Path of a tool without rotation.
         tool: Point of the tool that follows the path, in the tool's frame, [m].
     """
+    robot = session.robot
     coordinates = list(require_tcp(robot).coordinates)
     others = [k for k in range(3) if k not in coordinates]
     normal = [np.eye(3)[others[0]]] if len(others) == 1 else []
@@ -298,7 +299,7 @@ def _in_coordinates(robot: Robot, path: ToolPath, tool: Triple) -> Path:
         on_path = np.array([start, end])
         ends[:, coordinates] = on_path + rotation_shift(robot, on_path, tool)
         corners = place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
-        if find_below_bed(robot, corners) and not find_below_bed(robot, on_path):
+        if _below_bed(session, corners) and not _below_bed(session, on_path):
             corners = place_turning(robot, path(*ends, *normal, above=True)[:, coordinates], tool)
         return corners
 
@@ -401,7 +402,7 @@ def _begin_approaches(
         ends = list(closure.forward(nominal, names=names)[:, coordinates])
         starts = list(closure.tcp(drives, passive)[:, coordinates])
         for points in (ends, starts):
-            failures |= find_below_bed(robot, np.array(points), names)
+            failures |= _below_bed(session, np.array(points), names)
     if failures:
         return {}, {places[i]: error for i, error in failures.items()}
     approaches = [fill_approach(robot, stated, letter) for _, stated in places]
@@ -457,14 +458,13 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
     Raises:
         SessionError: If neither path is within reach.
     """
-    robot, checked = session.robot, list(stops)
-    zero = tool_at_zero(robot)
+    checked, zero = list(stops), start_point(session)
     ends = [(np.asarray(s.approach_point), np.asarray(s.point)) for s in stops]
     starts = [zero, *(point for _, point in ends[:-1])]
-    paths = _sample_paths(robot, [(a, *b) for a, b in zip(starts, ends, strict=True)])
+    paths = _sample_paths(session, [(a, *b) for a, b in zip(starts, ends, strict=True)])
     indirect = [i for i, path in enumerate(paths) if path is None]
     if indirect:
-        through_zero = _sample_paths(robot, [(starts[i], zero, *ends[i]) for i in indirect])
+        through_zero = _sample_paths(session, [(starts[i], zero, *ends[i]) for i in indirect])
         for i, path in zip(indirect, through_zero, strict=True):
             paths[i], checked[i] = path, replace(checked[i], via=(zero,))
     how = ", both directly and through the mechanical zero; insert a posture between them"
@@ -482,7 +482,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     Raises:
         SessionError: If the path leaves the workspace, or no direction has the stated approach.
     """
-    robot, length = session.robot, approach_share(session) * USUAL_LENGTH
+    length = approach_share(session) * USUAL_LENGTH
     first = np.asarray(stops[0].point)
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
     ends = [np.asarray(others[i]) for i in (-1, 0)] if others else [first + length]
@@ -500,7 +500,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
         begin = np.asarray(arrival.approach_point)
         polylines.append([position, *arrival.via, begin, point])
         position = point
-    paths = _sample_paths(robot, polylines)
+    paths = _sample_paths(session, polylines)
     return _predict(session, setup, checked, _require_paths(session, setup, checked, paths))
 
 
@@ -518,12 +518,12 @@ def _probe_stops(
     robot = session.robot
     points = np.array([stop.point for stop in stops])
     starts = probing_starts(robot, points, direction)
-    polylines = [[tool_at_zero(robot), starts[0], points[0]]]
+    polylines = [[start_point(session), starts[0], points[0]]]
     polylines += [
         [points[i], starts[i], *ends]
         for i, ends in enumerate(zip(starts[1:], points[1:], strict=True))
     ]
-    sampled = _sample_paths(robot, polylines, probing=True)
+    sampled = _sample_paths(session, polylines, probing=True)
     paths, checked = _require_paths(session, setup, stops, sampled), list[Stop]()
     drives = nominal_closure(robot).inverse(starts, names=[stop.posture for stop in stops])
     for i, (stop, begin) in enumerate(zip(stops, drives, strict=True)):
@@ -627,16 +627,16 @@ def _walk(corners: Array, length: float) -> Array:
 
 
 def _sample_paths(
-    robot: Robot, polylines: Sequence[Sequence[Array]], *, probing: bool = False
+    session: Session, polylines: Sequence[Sequence[Array]], *, probing: bool = False
 ) -> list[_Path | None]:
     """Samples of polylines of tool coordinates; None if the machine does not reach all of one.
 
     Args:
-        robot: The robot.
+        session: The session.
         polylines: Corners of each, shape (n_coordinates,) each, [m].
-        probing: Whether a surface stops the last motion of each. Both ends may be below a bed.
+        probing: Whether a surface stops the last motion of each, so that its end may be below it.
     """
-    sampled = [_sample(corners) for corners in polylines]
+    robot, sampled = session.robot, [_sample(corners) for corners in polylines]
     closure, points, failures = nominal_closure(robot), np.concatenate(sampled), Failures()
     try:
         drives, passive = closure.reach(points)  # cached: gauges of a leg have the same path
@@ -647,12 +647,19 @@ def _sample_paths(
         last = first + len(part)
         path = _Path(part, drives[first:last], passive[first:last])
         reached = failures.keys().isdisjoint(range(first, last))
-        moved = corners[1:-1] if probing else corners
-        if find_beyond_travel(robot, path.drives) or find_below_bed(robot, np.array(moved)):
+        moved = np.array(corners[1:-1] if probing else corners[1:])
+        if reached and (find_beyond_travel(robot, path.drives) or _below_bed(session, moved)):
             reached = False
         paths.append(path if reached else None)
         first = last
     return paths
+
+
+def _below_bed(session: Session, points: Array, names: Sequence[str] | None = None) -> Failures:
+    """Rows of tool positions that the controller displays below the bed of the machine."""
+    if session.robot.bed is None:
+        return {}
+    return find_below_bed(session.robot, shown_tool(session, points), names)
 
 
 def _sample(corners: Sequence[Array]) -> Array:

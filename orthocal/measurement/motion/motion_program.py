@@ -8,8 +8,8 @@ program also pauses before this motion, and starts in the first posture if the b
 With a probe it pauses above each posture, where the operator probes.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
-coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
-joints.
+coordinate rotation have no effect. Coordinates are those of nominal kinematics, or of
+the settings of a printer's firmware; comments list the joints.
 """
 
 from __future__ import annotations
@@ -21,9 +21,13 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError
-from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import describe_approach
-from orthocal.measurement.motion.guidance import dial_zero, shown_joints
+from orthocal.measurement.motion.guidance import (
+    dial_zero,
+    shown_joints,
+    shown_tool,
+    start_point,
+)
 from orthocal.measurement.motion.motion import SetupMotion, Stop
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
@@ -160,7 +164,7 @@ def write_program(
         f"{comment_safe(motion.setup, LONGEST_NAME)}, {motion.number} of {motion.count})",
         f"({comment_safe(sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
-        f"{_words(session, tool_at_zero(robot))})",
+        f"{_words(session, start_point(session))})",
         *_before_start(session, sensor, stops[0]),
         *([SIGNS_NOTE] if stated else []),
         *PREAMBLE[:-1],
@@ -275,7 +279,7 @@ def _words(session: Session, point: Array | None) -> str:
     coordinates = () if session.robot.tcp is None else session.robot.tcp.coordinates
     return " ".join(
         f"{LETTERS[c]}{format_fixed((v + session.controller_origin[c]) / MM, DECIMALS)}"
-        for c, v in zip(coordinates, np.asarray(point), strict=True)
+        for c, v in zip(coordinates, shown_tool(session, np.asarray(point)[None])[0], strict=True)
     )
 
 

@@ -20,6 +20,7 @@ from orthocal.measurement.motion.guidance import (
     range_of_expected,
     set_dial,
     shown_joints,
+    shown_tool,
 )
 from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
@@ -286,7 +287,7 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         align, go = f"{align}, which is also the first posture", []
     return [
         f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}."
-        f"{_around_ball(gauge.setup, motion.alignment or first)}",
+        f"{_around_ball(session, gauge.setup, motion.alignment or first)}",
         *(mounting_steps(gauge.setup.sensor) or _mount_on_base(gauge)),
         *go,
         _gauge_zero(session, gauge.setup, first),
@@ -329,11 +330,11 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
     )
 
 
-def _around_ball(setup: Setup, begin: Stop) -> str:
+def _around_ball(session: Session, setup: Setup, begin: Stop) -> str:
     """Way to the alignment posture past a fixed ball, which may stand at the mechanical zero."""
     if not isinstance(setup.sensor, BallBar) or begin.point is None:
         return ""
-    at = ", ".join(_short(v) for v in begin.point)
+    at = ", ".join(_short(v) for v in shown_tool(session, begin.point[None])[0])
     return (
         " If the fixed ball is in place already, jog around ball and post to this posture (tool at "
         f"{at} mm) before you start the program."
@@ -414,7 +415,8 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         if approaches:
             cells.append((describe_approach(robot, stop.approach), ""))
         if tool and stop.point is not None:
-            cells.append((", ".join(_short(v) for v in stop.point), ""))
+            shown = shown_tool(session, stop.point[None])[0]
+            cells.append((", ".join(map(_short, shown)), ""))
         cells += [(text, "number") for text in _joint_values(robot, stop.drives)]
         if expected:
             cells.append((_number(stop.expected / MM, 2, sign=True), "number"))

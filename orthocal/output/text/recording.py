@@ -24,7 +24,7 @@ from orthocal.measurement.motion.approach import (
     fill_approach,
     label_reading,
 )
-from orthocal.measurement.motion.guidance import guide, set_dial
+from orthocal.measurement.motion.guidance import guide, set_dial, shown_tool
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recorded_rows import RecordedReading
 from orthocal.measurement.recording import Recording
@@ -345,7 +345,8 @@ class RecordingText:
         text = ", ".join(joint.replace(" ", GLUE) for joint in joints)
         lines = [self.wrap(f"{name}joints {text}", indent="  ")]
         if posture in guidance.tool:
-            values = zip("xyz", guidance.tool[posture], strict=True)
+            place = guidance.tool[posture]
+            values = zip("xyz", shown_tool(self._session, place[None])[0], strict=True)
             tool = ", ".join(f"{axis}{GLUE}{format_fixed(v / MM, 3)}" for axis, v in values)
             lines.append(self.wrap(f"{name}tool {tool}{GLUE}mm", indent="  "))
         return "\n".join(lines)

@@ -1,0 +1,74 @@
+"""Plans of further readings of a printer from the session of its log."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated_printer import Firmware, nominal, rings, write_log
+from tolerances import CLOSED_FORM
+from uncompared import few_machines, uncompared
+
+from orthocal import load_plan, load_session, plan_readings, write_session
+from orthocal.errors import SessionError
+from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
+from orthocal.measurement.joining import join_sessions
+from orthocal.output.sheet.page import sheet_files
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.owned_sensors import load_owned_sensor
+from orthocal.units import MM
+
+BAR = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-25, 25]\nlength_mm: 50\n"
+CALIBRATED = Firmware(
+    140.4, np.array([279.1, 280.2, 281.3]), np.array([209.2, 328.9, 90.0]), nominal().endstops
+)
+"""Settings that a calibration chose: unlike every nominal machine."""
+
+
+@pytest.fixture(scope="module", params=[nominal(), CALIBRATED], ids=["design", "calibrated"])
+def printer(request, tmp_path_factory):
+    """Session of a printer's log, and a plan with a ball bar from it."""
+    folder = tmp_path_factory.mktemp("printer")
+    (folder / "log.txt").write_text(write_log("klipper", request.param, rings(), np.zeros(41)))
+    write_printer_import(import_printer_log(folder / "log.txt"), folder / "log")
+    (folder / "bar.yaml").write_text(BAR)
+    log = load_session(folder / "log")
+    equipment = Equipment(owned=(load_owned_sensor(folder / "bar.yaml"),))
+    with uncompared(), few_machines():
+        plan = plan_readings(
+            log.robot, "offsets", hours=0.5, equipment=equipment, measured=log, starts=1
+        )
+    return log, plan.session
+
+
+def test_a_plan_from_a_log_states_its_controller(printer, tmp_path):
+    log, plan = printer
+    write_session(replace(plan, robot_reference=str(log.robot.folder)), tmp_path / "bar")
+    written = load_plan(tmp_path / "bar")
+    assert written.firmware == log.firmware
+    assert np.array_equal(written.controller_offsets, [0.0, 0.0, 0.0])
+    assert len(join_sessions([log, written]).readings) == len(log.readings) + len(plan.readings)
+    with pytest.raises(SessionError, match=r"copy the block controller of .*log") as e:
+        join_sessions([log, replace(written, firmware=None)])
+    assert str(e.value.where).endswith("bar/session.yaml: controller.firmware")
+
+
+def test_programs_of_a_printer_have_the_coordinates_of_its_firmware(printer):
+    """The name of a posture is where the firmware is sent. The drives are those it moves to."""
+    log, plan = printer
+    programs = "".join(t for n, t in sheet_files(plan).items() if n.endswith(".ngc"))
+    checked = 0
+    for name, posture in plan.postures.items():
+        shift = dict(re.findall(r"([xyz])([-+][\d.]+)", name))
+        point = np.array([float(shift.get(k, 0.0)) for k in "xyz"])
+        there = log.firmware.forward(posture.drives)[0] / MM
+        assert np.abs(there - point).max() < 1e-3  # of the name
+        line = r"posture {}[;)].*\n(?:G53.*\n)*G53 G1 X(.*) Y(.*) Z(.*) F120"
+        for words in re.findall(line.format(re.escape(name)), programs):
+            assert np.abs(np.array(words, float) - there).max() < 1e-4
+            checked += 1
+    assert checked >= len(plan.readings)
+    heights = [float(z) for z in re.findall(r"(?m)^G53 .* Z(.*) F", programs)]
+    assert min(heights) > -CLOSED_FORM
