@@ -98,6 +98,9 @@ def test_words_of_the_instrument(folder, run, sensor, instrument):
     words = {"ball bar": "ball bar", "probe": "probe", "gauge or its stand": "dial"}
     touched = [noun for text, noun in words.items() if f"do not touch the {text}" in head]
     assert touched == ([] if pairs else [instrument])
+    is_probe = instrument == "probe"
+    assert ("that of the posture minus that at the trigger" in head) == is_probe
+    assert ("and align the" in head) == (instrument in ("dial", "ball bar"))
 
 
 def rows_of(folder):

@@ -368,7 +368,10 @@ def test_a_bed_is_probed_from_above(owned, effects):
     with uncompared(), few_machines():
         session = plan_readings(robot, "offsets", hours=0.1, equipment=equipment, starts=1).session
     assert {r.approach for r in session.readings} == {"nnn"}
-    program = sheet_files(session, options=ProgramOptions(dwell=1.0))["01-probe.ngc"]
+    files = sheet_files(session, options=ProgramOptions(dwell=1.0))
+    assert "begin 10 mm before the surface" in files["sheet.html"]
+    assert "Move to the" not in files["sheet.html"]
+    program = files["01-probe.ngc"]
     assert lowest({"": program}) == 10.0
     assert program.count("\nM0\n") == len(session.readings)
     assert "G4 " not in program

@@ -118,6 +118,24 @@ def test_readings_are_heights_of_the_tip_above_the_surface(tmp_path, printer):
         assert abs(found[row] - height + value["trigger"]) < CLOSED_FORM
 
 
+def test_a_reading_is_the_coordinate_of_the_posture_minus_that_at_the_trigger(tmp_path, printer):
+    """If all slides move down by the same distance, so does the tool; with a leaning one nearly."""
+    plan = load_plan(bed(tmp_path, printer, rings()[::8]))
+    errors = {"a_slide.offset": 0.8e-3, "radius": 1.2e-3, "b_slide.ry": 3e-3, "c_slide.scale": 2e-4}
+    machine = plan.robot.with_errors(errors)
+    expected = predict_readings(plan, errors, nuisance=np.zeros(2 + 1))
+    for row, reading in enumerate(plan.readings):
+        commanded = plan.postures[reading.posture].drives
+        lowered = 0.0
+        for _ in range(5):
+            lowered += frame_pose(machine, commanded - lowered, "tcp").translation[2]
+        assert abs(lowered) > 0.1e-3
+        assert expected[row] == pytest.approx(lowered, rel=1e-3)
+    above, rule = plan.setups["bed"].sensor.mounting_steps
+    assert "begin 10 mm before the surface" in above
+    assert "the coordinate z, that of the posture minus that at the trigger" in rule
+
+
 def published(folder, printer):
     """Session of the published triggers."""
     middle = ENDSTOPS_MM[0] + np.sqrt(280.0**2 - 140.0**2)

@@ -285,9 +285,14 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
     align = "Move to the alignment posture"
     if gauge.alignment == first.posture:
         align, go = f"{align}, which is also the first posture", []
-    return [
+    to_alignment = [
         f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}."
-        f"{_around_ball(session, gauge.setup, motion.alignment or first)}",
+        f"{_around_ball(session, gauge.setup, motion.alignment or first)}"
+    ]
+    if probing_direction(gauge.setup.sensor) is not None:  # nothing is aligned on the surface
+        to_alignment, go = [], []
+    return [
+        *to_alignment,
         *(mounting_steps(gauge.setup.sensor) or _mount_on_base(gauge)),
         *go,
         _gauge_zero(session, gauge.setup, first),

@@ -33,7 +33,7 @@ from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
 from orthocal.robot.model import drive_keys, name_coordinates
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
+from orthocal.sensors.protocol import instrument, mounting_steps, probing_direction, reads_pairs
 from orthocal.session.points import base_name, one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, quote_path, spans
@@ -264,6 +264,11 @@ class RecordingText:
             )
         elif isinstance(setup.sensor, Points):
             parts.append("From then on do not touch the instrument until the setup is complete.")
+        elif probing_direction(setup.sensor) is not None:
+            parts.append(
+                f"{set_dial(session, name)} From the first reading on do not touch the "
+                f"{gauge_or_stand} until the setup is complete."
+            )
         elif not reads_pairs(setup.sensor):
             parts.append(
                 f"Go to {aligned} and align the {gauge}. {go}{set_dial(session, name)} From then "
