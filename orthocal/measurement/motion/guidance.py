@@ -14,7 +14,8 @@ from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.observations import drive_table
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.protocol import Contact, Sensor
 from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import MM
 
@@ -74,6 +75,25 @@ def with_alignment(session: Session) -> Session:
     """Session with an additional reading of each setup in its alignment posture."""
     extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
     return replace(session, readings=(*session.readings, *extra))
+
+
+def is_displaced(sensor: Sensor) -> bool:
+    """True if a tip is displaced from its rod in the mechanical zero, where it may not touch it."""
+    return isinstance(sensor, LegIndicator) and any(sensor.beside)
+
+
+def describe_mounting(sensor: Sensor, aligned_at: str) -> str:
+    """Description of a sensor for the operator who mounts it.
+
+    A displaced tip is described in the alignment posture, in which it touches its rod.
+
+    Args:
+        sensor: The sensor.
+        aligned_at: Name of its alignment posture.
+    """
+    if not isinstance(sensor, LegIndicator) or not is_displaced(sensor):
+        return sensor.describe()
+    return f"{replace(sensor, beside=(0.0, 0.0, 0.0)).describe()}, aligned in {aligned_at}"
 
 
 def dial_zero(gauge: Gauge) -> str:

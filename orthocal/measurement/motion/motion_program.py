@@ -23,6 +23,7 @@ from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.measurement.motion.approach import describe_approach
 from orthocal.measurement.motion.guidance import (
+    describe_mounting,
     dial_zero,
     shown_joints,
     shown_tool,
@@ -144,8 +145,7 @@ def write_program(
     Raises:
         ParameterError: If the drives do not command the tool.
     """
-    options = options or ProgramOptions()
-    robot = session.robot
+    options, robot = options or ProgramOptions(), session.robot
     if robot.tcp is None or any(s.point is None for s in motion.stops):
         raise ParameterError(
             "the drives do not command the tool: there are no coordinates for a program",
@@ -154,6 +154,7 @@ def write_program(
     of_setup = session.setups[motion.setup]
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
     read, probed = "read", probing_direction(sensor) is not None
+    aligned = session.alignment_postures[motion.setup]
     if probed:  # by the operator
         read = "probe, note the trigger, move back"
         options = replace(options, dwell=None, trigger=None)
@@ -162,7 +163,7 @@ def write_program(
     lines = [
         f"(orthocal: {comment_safe(robot.name, LONGEST_NAME)}, setup "
         f"{comment_safe(motion.setup, LONGEST_NAME)}, {motion.number} of {motion.count})",
-        f"({comment_safe(sensor.describe(), 120)})",
+        f"({comment_safe(describe_mounting(sensor, aligned), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(session, start_point(session))})",
         *_before_start(session, sensor, stops[0]),

@@ -15,8 +15,10 @@ from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length, describe_approach
 from orthocal.measurement.motion.guidance import (
+    describe_mounting,
     dial_zero,
     guide,
+    is_displaced,
     range_of_expected,
     set_dial,
     shown_joints,
@@ -156,13 +158,14 @@ def _front(
         *("", "setup", "measures", *(["gauge"] if several else []), "readings"),
         *(["program"] if with_programs else []),
     )
-    rows = []
+    rows, aligned_at = [], session.alignment_postures
     for m in motions:
         count = str(sum(s.role == "reading" for s in m.stops))
         setup = session.setups[m.setup]
         gauge = (setup.gauge,) if several else ()
         program = (program_name(m),) if with_programs else ()
-        rows.append((str(m.number), m.setup, setup.sensor.describe(), *gauge, count, *program))
+        measured = describe_mounting(setup.sensor, aligned_at[m.setup])
+        rows.append((str(m.number), m.setup, measured, *gauge, count, *program))
     normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken. If "
@@ -247,10 +250,10 @@ def _setup(
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
     program = f" Program: {program_name(motion)}." if with_program else ""
     sensor, name = session.setups[motion.setup].sensor, session.setups[motion.setup].gauge
-    measured = sensor.describe()
+    measured = describe_mounting(sensor, gauge.alignment)
     if session.distinguish_gauge(name):
         measured += f". Gauge: {_gauge(name, session.gauges[name])}"
-    at_zero = "" if gauge.leg is None else "At the mechanical zero: "
+    at_zero = "" if gauge.leg is None or is_displaced(sensor) else "At the mechanical zero: "
     end = _compare_closing(session, motion)
     end += REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
     return (

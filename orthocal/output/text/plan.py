@@ -23,6 +23,7 @@ from orthocal.measurement.motion.approach import (
     approach_length,
     describe_approach,
 )
+from orthocal.measurement.motion.guidance import describe_mounting
 from orthocal.output.sheet.gauge_position import name_tip
 from orthocal.output.text.accuracy import (
     NOTICEABLE,
@@ -81,8 +82,9 @@ PLACE_TOLERANCES = {BallBar.kind: ("centre_tolerance_mm", "length_tolerance_mm")
 
 HOW_TO = {
     LegIndicator.kind: (
-        "Dial at a leg: mount it so that it touches at the stated part of the length from the "
-        "slide, with the machine at its mechanical zero."
+        "Dial at a leg: mount it in the first posture of its setup, where the sheet states the "
+        "place of contact. The stated part of the length from the slide is that at the mechanical "
+        "zero."
     ),
     BallBar.kind: (
         "Ball bar: fix one ball on the table at the stated place and clamp the other to the tool. "
@@ -457,10 +459,11 @@ def _posture(reading: Reading, robot: Robot) -> str:
 
 def _setups(plan: MeasuringPlan) -> RenderableType:
     s = one_row_per_point(plan.session)
+    aligned_at = s.alignment_postures
     rows = [
         (
             setup.name,
-            setup.sensor.describe(),
+            describe_mounting(setup.sensor, aligned_at[setup.name]),
             " ".join(_posture(r, s.robot) for r in s.readings if r.setup == setup.name),
         )
         for setup in list(s.setups.values())[:MOST_LISTED]

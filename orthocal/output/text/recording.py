@@ -24,7 +24,13 @@ from orthocal.measurement.motion.approach import (
     fill_approach,
     label_reading,
 )
-from orthocal.measurement.motion.guidance import guide, set_dial, shown_tool
+from orthocal.measurement.motion.guidance import (
+    describe_mounting,
+    guide,
+    is_displaced,
+    set_dial,
+    shown_tool,
+)
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recorded_rows import RecordedReading
 from orthocal.measurement.recording import Recording
@@ -254,8 +260,10 @@ class RecordingText:
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
-        place = "Place at the mechanical zero" if hasattr(sensor, "leg") else "Place"
-        parts = [f"{place}: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        at_zero = hasattr(sensor, "leg") and not is_displaced(sensor)
+        place = "Place at the mechanical zero" if at_zero else "Place"
+        measured = describe_mounting(sensor, aligned)
+        parts = [f"{place}: {measured}", self._stand(name), _gauge(session, setup)]
         gauge, gauge_or_stand = _name_gauge(setup), _name_gauge(setup, stand=True)
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(

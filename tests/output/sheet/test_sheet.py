@@ -445,3 +445,20 @@ def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
         )
     assert len(heights) == 6
     assert max(front, *heights) <= PAGE_HEIGHT
+
+
+def test_a_displaced_tip_is_described_in_its_alignment_posture(small, tmp_path):
+    """At the mechanical zero the tip is beside its rod; nobody can mount it there."""
+    setup = small.setups["xy"]
+    displaced = replace(setup, sensor=replace(setup.sensor, beside=(0.0, 0.0, 0.005)))
+    plan = replace(small, setups={**small.setups, "xy": displaced}).select(
+        [r for r in small.readings if r.setup == "xy"]
+    )
+    path = write_session(replace(plan, robot_reference=str(small.robot.folder)), tmp_path / "plan")
+    sheet = sheet_files(plan)
+    (program,) = [text for name, text in sheet.items() if name.endswith(".ngc")]
+    recorded = run_orthocal(tmp_path, "record", path.parent, typed="quit\n").stdout
+    for text in (sheet["sheet.html"], program, recorded):
+        assert "aligned in" in text
+        assert "centre line by" not in text
+        assert not re.search("(?i)at the mechanical zero: leg", text)
