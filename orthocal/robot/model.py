@@ -511,11 +511,11 @@ class Robot:
             twists: Placements, mapped to their twists δ, shape (6,), [m, rad].
         """
         model = self.model.copy()
-        frames: dict[str, Array] = {}
+        frames: dict[int, Array] = {}
         for placement, twist in twists.items():
             delta = np.asarray(twist, dtype=np.float64)
             if placement.of_frame:
-                frames[str(model.frames[placement.index].name)] = delta
+                frames[placement.index] = delta
             else:
                 i = placement.index
                 model.jointPlacements[i] = model.jointPlacements[i] * pin.exp6(delta)

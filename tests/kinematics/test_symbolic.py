@@ -17,7 +17,7 @@ from orthocal.kinematics.symbolic import (
     SymbolicTree,
     erroneous_placements,
 )
-from orthocal.robot.frames import find_frame, place_frames
+from orthocal.robot.frames import place_frames
 from orthocal.robot.urdf import load_urdf
 
 
@@ -46,11 +46,7 @@ NAMES = ["orthoglide", "fivebar", "tilted", "built"]
 
 
 def moving_frames(model):
-    return [
-        i
-        for i, f in enumerate(model.frames)
-        if f.type in (pin.FrameType.BODY, pin.FrameType.FIXED_JOINT) and i > 0
-    ]
+    return list(range(1, model.nframes))
 
 
 def build(model, joints, frames):
@@ -59,7 +55,7 @@ def build(model, joints, frames):
     dj = ca.SX.sym("dj", 6, len(joints))
     df = ca.SX.sym("df", 6, len(frames))
     at = [Placement(model.getJointId(name), False) for name in joints]
-    at += [Placement(find_frame(model, name, where=""), True) for name in frames]
+    at += [Placement(frame, True) for frame in frames]
     twists = dict(zip(at, ca.horzsplit(ca.horzcat(dj, df)), strict=True))
     at_joints, at_frames = erroneous_placements(model, twists)
     tree = SymbolicTree(model, q, joint_placements=at_joints, frame_placements=at_frames)
@@ -73,7 +69,7 @@ def pinocchio_poses(model, v, joints, frames, dj, df):
     for i, name in enumerate(joints):
         k = moved.getJointId(name)
         moved.jointPlacements[k] = moved.jointPlacements[k] * pin.exp6(dj[:, i])
-    place_frames(moved, model, {name: df[:, i] for i, name in enumerate(frames)})
+    place_frames(moved, model, {frame: df[:, i] for i, frame in enumerate(frames)})
     data = moved.createData()
     pin.framesForwardKinematics(moved, data, pin.integrate(moved, pin.neutral(moved), v))
     poses = [data.oMf[i] for i in moving_frames(moved)]
@@ -81,9 +77,13 @@ def pinocchio_poses(model, v, joints, frames, dj, df):
 
 
 def some_frames(model):
-    names = [model.frames[i].name for i in moving_frames(model)]
-    bodies = [n for n in names if model.existFrame(n, pin.FrameType.BODY)]
-    return bodies[:: max(1, len(bodies) // 6)]
+    """Links and moving joints whose frames have errors, some on one body."""
+    kinds = [model.frames[i].type for i in moving_frames(model)]
+    bodies, joints = (
+        [i for i, kind in enumerate(kinds, 1) if kind == of]
+        for of in (pin.FrameType.BODY, pin.FrameType.JOINT)
+    )
+    return bodies[:: max(1, len(bodies) // 6)] + joints[::3]
 
 
 @pytest.mark.parametrize("name", NAMES)
