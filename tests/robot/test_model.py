@@ -12,6 +12,11 @@ from tolerances import KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import RobotError
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.kinematics.conditions import UseConditions
+from orthocal.kinematics.loop_closure import LoopClosure
+
+WARM = UseConditions(temperature=40.0)
 
 
 def test_the_orthoglide_is_the_designed_machine(orthoglide):
@@ -131,6 +136,32 @@ def test_the_same_files_give_the_same_robot_until_one_is_changed(root, tmp_path)
     assert load_robot(folder).drive_zero == pytest.approx([0.21, 0.21])
     path.write_text(text)
     assert load_robot(folder) is first
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "evaluate"),
+    [
+        (  # the other rod does not become warm
+            "        b: {root: y_bar_b",
+            "      # b: {root: y_bar_b",
+            lambda r: LoopClosure(r, conditions=WARM).forward(r.drive_zero).tolist(),
+        ),
+        ("full: complete", "full: ['*.offset']", machine_errors),
+    ],
+)
+def test_an_edited_robot_has_nothing_of_the_one_before(root, tmp_path, old, new, evaluate):
+    source = root / "robots/biglide"
+    urdf, yaml = (next(source.glob(f"*.{suffix}")).read_text() for suffix in ("urdf", "yaml"))
+    yaml += "  effects: {thermal: {}}\n"
+    edited = yaml.replace(old, new)
+    results = []
+    for name, text in (("edited", yaml), ("edited", edited), ("new", edited)):
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.urdf").write_text(urdf)
+        (folder / f"{name}.yaml").write_text(text)
+        results.append(evaluate(load_robot(folder)))
+    assert results[1] == results[2] != results[0]
 
 
 def test_a_folder_of_another_name_is_another_robot(root, tmp_path, monkeypatch):
