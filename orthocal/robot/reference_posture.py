@@ -174,11 +174,11 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     """
     scales = _coordinate_scales(robot)
     values = _singular_values(robot, closing)
-    last = int((values > NULL_SPACE_TOLERANCE).sum()) - 1  # others belong to dependent rows
-    smallest = SINGULARITY_MARGIN * values[last]
+    independent = values > NULL_SPACE_TOLERANCE  # others belong to dependent rows
+    smallest = SINGULARITY_MARGIN * values[independent][-1:]  # none without passive joints
 
     def is_regular(candidate: Closing) -> bool:
-        return bool(_singular_values(robot, candidate)[last] >= smallest)
+        return bool((_singular_values(robot, candidate)[independent][-1:] >= smallest).all())
 
     free = np.concatenate([movable, robot.passive_index])
 
