@@ -552,11 +552,11 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
     """
     failures, labels = Failures(), label_postures(names, len(drives))
     for drive, values in zip(robot.drives, drives.T, strict=True):
-        factor, unit = drive.edge_factor, drive.edge_unit
+        size = drive.joint_size
         for i in np.flatnonzero(drive.is_beyond(values)).tolist():
             reason = (
-                f"{drive.name}_{unit} is {values[i] * factor:g}; the drive reaches from "
-                f"{drive.lower * factor:g} to {drive.upper * factor:g}"
+                f"{drive.name}_{drive.joint_unit} is {values[i] / size:g}; the drive reaches from "
+                f"{drive.lower / size:g} to {drive.upper / size:g}"
             )
             failures.setdefault(i, ClosureError(reason, posture=labels[i]))
     return dict(sorted(failures.items()))
