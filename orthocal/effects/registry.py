@@ -55,7 +55,7 @@ def register_effect(effect: type[Effect]) -> None:
 
 
 def unregister_effect(name: str) -> None:
-    """Remove a registered effect."""
+    """Remove a registered effect; a built-in effect that it replaced returns."""
     _EFFECTS.unregister(name)
 
 
