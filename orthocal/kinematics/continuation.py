@@ -17,6 +17,7 @@ from orthocal.errors import ClosureError
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.robot.closing import CLOSURE_TOLERANCE, RANK_TOLERANCE, describe_opening
 from orthocal.robot.model import (
+    LIMIT_TOLERANCE,
     Robot,
     closure_row_units,
     closure_turns,
@@ -60,9 +61,6 @@ it is out of reach, or it is approached in shorter steps. Near a singular postur
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
 LARGEST_CONTINUATION_MOVE = 0.3
 """Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
-
-LIMIT_TOLERANCE = 1e-9
-"""Accepted excess over the limit of a joint, [m or rad]."""
 
 MAX_POINTS = 4096
 """Postures per block of a batch of machines, which limits the memory of their Jacobians."""

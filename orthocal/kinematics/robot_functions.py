@@ -30,7 +30,7 @@ from orthocal.kinematics.symbolic import (
     nominal_placement,
 )
 from orthocal.robot.frames import Placement, carriers
-from orthocal.robot.model import Closure, Robot, joint_axis
+from orthocal.robot.model import Closure, Robot, joint_axis, require_tcp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +263,7 @@ class RobotFunctions:
 
     def _tool(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Position p of the tool, ∂p/∂q and ∂p/∂ξ."""
-        frame = self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
+        frame = self.robot.frame_id(require_tcp(self.robot).frame)
         return self.tree.frame_pose(frame).position, *self.wrench_rows(frame, ca.SX.eye(3))
 
     def wrench_rows(

@@ -24,8 +24,8 @@ from orthocal.units import DRIVE_UNITS, InUnit, Unit, format_fixed
 PARALLEL_SINE = 0.02
 """Sine of the largest angle between a slide and a leg that counts as parallel to it."""
 
-TRAVEL_SLACK = 1e-9
-"""Rounding error by which a coordinate may exceed the travel of a drive, [m, rad]."""
+LIMIT_TOLERANCE = 1e-9
+"""Rounding error by which a coordinate may exceed the limits of its joint, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ class Drive(InUnit):
         """True where drive coordinates, any shape, [unit], exceed the travel."""
         values = np.asarray(coordinate, dtype=np.float64)
         return np.asarray(
-            (values < self.lower - TRAVEL_SLACK) | (values > self.upper + TRAVEL_SLACK)
+            (values < self.lower - LIMIT_TOLERANCE) | (values > self.upper + LIMIT_TOLERANCE)
         )
 
     def describe_beyond(self, coordinate: float) -> str:

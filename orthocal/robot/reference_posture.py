@@ -18,6 +18,7 @@ from orthocal.errors import RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import MAX_STEPS, Closing, describe_opening
 from orthocal.robot.model import (
+    LIMIT_TOLERANCE,
     Robot,
     closure_row_units,
     closure_turns,
@@ -38,9 +39,6 @@ MAX_OPERATIONS = 2e8
 
 NULL_SPACE_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
-
-LIMIT_TOLERANCE = 1e-9
-"""Distance from a joint limit that counts as a rounding error, [m or rad]."""
 
 SNAP_DISTANCE = 1e-3
 """Distance from its zero at which a drive is set to its zero, [rad] or characteristic lengths."""
