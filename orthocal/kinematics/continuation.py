@@ -107,7 +107,7 @@ class System:
         self.shortest = robot.closure_rows + n_tool != index.size
         self.units = coordinate_units(robot)[index]
         self.turning = coordinate_turns(robot.model)[index]
-        self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot))
+        self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot.model))
         names = coordinate_names(robot.model)
         self.names = tuple(names[k] for k in index.tolist())
         self.row_units = np.append(closure_row_units(robot), np.ones(n_tool))

@@ -37,6 +37,7 @@ from orthocal.robot.model import (
     Tcp,
     Use,
     build_constraints,
+    coordinate_limits,
     joint_axis,
 )
 from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
@@ -251,10 +252,7 @@ def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> D
     entry = keys.orthocal.drives.get(motor, DriveKeys())
     joint_keys = entry.joint or JointKeys()
     zero = _in_drive_unit(entry, "zero", unit, here) or 0.0
-    lower, upper = -np.inf, np.inf
-    if joint.nq == 1:
-        limits = model.lowerPositionLimit, model.upperPositionLimit
-        lower, upper = (float(v[joint.idx_q]) for v in limits)
+    lower, upper = (float(limits[joint.idx_v]) for limits in coordinate_limits(model))
     if _has_zero(keys, motor) and not lower <= zero <= upper:
         name, size = DRIVE_UNITS[unit]
         raise RobotError(

@@ -406,7 +406,7 @@ class Robot:
         Returns:
             All joint coordinates, and the residual.
         """
-        lower, upper = coordinate_limits(self)
+        lower, upper = coordinate_limits(self.model)
         data = self.model.createData()
 
         def complete(values: Array) -> Array:
@@ -623,9 +623,8 @@ def coordinate_units(robot: Robot) -> Array:
     return np.where(coordinate_turns(robot.model), robot.characteristic_length, 1.0)
 
 
-def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
+def coordinate_limits(model: pin.Model) -> tuple[Array, Array]:
     """Lower and upper bounds of the joint coordinates, shape (nv,) each; infinite if unbounded."""
-    model = robot.model
     lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     single = np.flatnonzero(np.array(model.nqs) == 1)
     in_q, in_v = np.array(model.idx_qs)[single], np.array(model.idx_vs)[single]

@@ -72,7 +72,7 @@ def find_reference_posture(
     Raises:
         RobotError: If no posture with closed loops is found; states the smallest opening.
     """
-    lower, upper = coordinate_limits(robot)
+    lower, upper = coordinate_limits(robot.model)
     start = robot.joint_coordinates(robot.drive_zero, passive_start)
     movable = robot.drive_index[~np.asarray(fixed_zeros, dtype=np.bool_)]
     start[movable] = np.clip(start[movable], lower[movable], upper[movable])
@@ -116,7 +116,7 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
 
 def _find_joints_outside_limits(robot: Robot, start: Array, free: Indices) -> list[str]:
     """Joints outside their limits in a posture that closes the loops if limits are ignored."""
-    lower, upper = coordinate_limits(robot)
+    lower, upper = coordinate_limits(robot.model)
     if not np.isfinite([lower[free], upper[free]]).any():
         return []
     closings = (
@@ -234,7 +234,7 @@ def _null_space(matrix: Array) -> Array:
 
 def _remove_full_turns(robot: Robot, coordinates: Array) -> Array:
     """Coordinates of unlimited passive joints reduced to ±π."""
-    unlimited = np.isinf(coordinate_limits(robot)).all(axis=0) & coordinate_turns(robot.model)
+    unlimited = np.isinf(coordinate_limits(robot.model)).all(axis=0) & coordinate_turns(robot.model)
     unlimited[robot.drive_index] = False
     turns = np.round(coordinates / (2.0 * np.pi))
     return np.where(unlimited, coordinates - 2.0 * np.pi * turns, coordinates)
