@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import pinocchio as pin
 
 from orthocal.arrays import Array
@@ -52,6 +53,19 @@ def carriers(model: pin.Model, frame: int) -> Iterator[int]:
 def nearest_carrier(model: pin.Model, frame: int, frames: Container[int]) -> int | None:
     """Nearest of some frames that carries a frame on the same joint; None if none does."""
     return next((f for f in carriers(model, frame) if f != frame and f in frames), None)
+
+
+def frame_jacobian(model: pin.Model, data: pin.Data, frame: int) -> Array:
+    """Jacobian of a frame's velocity and angular velocity in the world, shape (6, nv).
+
+    Args:
+        model: The model.
+        data: Its data after `computeJointJacobians` and `updateFramePlacements`.
+        frame: Index of the frame.
+    """
+    world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    # a vector for a model of one joint
+    return np.reshape(pin.getFrameJacobian(model, data, frame, world), (6, model.nv))
 
 
 def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[int, Array]) -> None:

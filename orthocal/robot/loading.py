@@ -27,7 +27,7 @@ from orthocal.robot.description import (
     RodKeys,
     load_description,
 )
-from orthocal.robot.frames import find_frame
+from orthocal.robot.frames import find_frame, frame_jacobian
 from orthocal.robot.model import (
     Closure,
     Drive,
@@ -382,12 +382,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> Mapping[str, Leg]:
             )
             for rod, rod_keys in entry.rods.items()
         }
-        jacobian = pin.getFrameJacobian(
-            model,
-            data,
-            find_frame(model, entry.root, where=here),
-            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-        )[:3]
+        jacobian = frame_jacobian(model, data, find_frame(model, entry.root, where=here))[:3]
         by_passive = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
         motion = jacobian[:, robot.drive_index].sum(axis=1)
         motion /= max(float(np.linalg.norm(motion)), 1e-9)

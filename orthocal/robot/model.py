@@ -457,6 +457,7 @@ class Robot:
             constraint.calc(self.model, data, cdata)
             error = np.array(cdata.constraint_position_error)
             jacobian = constraint.jacobian(self.model, data, cdata)
+            jacobian = jacobian.reshape(error.size, self.model.nv)  # a vector for one joint
             if closure.kind == "6d":  # Pinocchio differentiates the pose, not its logarithm
                 c1mc2 = cdata.c1Mc2
                 jacobian = pin.Jlog6(c1mc2) @ c1mc2.toActionMatrixInverse() @ jacobian

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import linkages
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -15,6 +16,7 @@ from orthocal.errors import RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.sensitivity import ToolSensitivity
 
 WARM = UseConditions(temperature=40.0)
 
@@ -117,6 +119,20 @@ def test_an_offset_moves_the_slider_by_itself(orthoglide):
     pin.framesForwardKinematics(moved.model, data, q)
     slider = data.oMf[moved.frame_id("y_slider")].translation
     assert np.abs(slider - [0.0, 0.31225, 0.0]).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("pairs", ["", "[slide, post]"])
+def test_a_machine_may_be_a_single_joint(tmp_path, pairs):
+    joints = linkages.joint("slide", "base", (0, 0, 0), "x", kind="prismatic")
+    joints += linkages.joint("end", "slide", (0.1, 0, 0), "")
+    joints += linkages.joint("post", "base", (0, 0, 0), "")
+    yaml = f"closed_loop: [{pairs}]\ntype: [{'3d' if pairs else ''}]\nname_mot: [slide]\n"
+    yaml += "orthocal: {tcp: {frame: end, coordinates: [x]}, legs: {x: {root: slide, tip: end}}}\n"
+    robot = linkages.make_robot(tmp_path / "slide", joints, yaml)
+    assert np.array_equal(robot.legs["x"].root_motion, [1.0, 0.0, 0.0])
+    assert "slide.offset" in robot.parameters.complete
+    error = ToolSensitivity(robot, free=["slide.offset"])([0.0], passive=np.zeros((1, 0)))
+    assert np.abs(error[0, :, 0] - [1.0, 0.0, 0.0]).max() < KINEMATICS
 
 
 def test_read_only_arrays_cannot_be_written_to(orthoglide):
