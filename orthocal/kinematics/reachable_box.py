@@ -125,9 +125,13 @@ def _nominal_reach_check(robot: Robot) -> RequireReach:
     def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         require_travel(robot, drives)
-        jacobians = sensitivity(drives, passive=passive)[:, coordinates] / units
+        singular = ClosureError("is nearly singular", posture="a corner")
+        try:
+            jacobians = sensitivity(drives, passive=passive)[:, coordinates] / units
+        except np.linalg.LinAlgError:  # of the closures: the drives leave motions free
+            raise singular from None
         if (np.linalg.cond(jacobians) > MAX_CONDITION_NUMBER).any():
-            raise ClosureError("is nearly singular", posture="a corner")
+            raise singular
 
     return require_reach
 

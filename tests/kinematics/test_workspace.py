@@ -122,3 +122,15 @@ def test_radians_and_metres_of_drives_are_not_compared(tmp_path):
     yaml += "orthocal: {tcp: {frame: slide, coordinates: [x, y]}}\n"
     robot = linkages.make_robot(tmp_path / "polar", joints, yaml)
     assert find_workspace(robot).half_side > 0.03
+
+
+def test_a_machine_with_a_free_motion_has_no_workspace(tmp_path):
+    """A closure that the free hinge does not change."""
+    joints = linkages.joint("turn", "base", (0, 0, 0), "z")
+    joints += linkages.joint("tool", "turn", (0.1, 0, 0), "")
+    joints += linkages.joint("free", "base", (0, 0, 0), "z")
+    yaml = "closed_loop: [[base, free]]\ntype: [3d]\nname_mot: [turn]\northocal:\n"
+    yaml += "  closures: {post: {rows: [z]}}\n  tcp: {frame: tool, coordinates: [y]}\n"
+    robot = linkages.make_robot(tmp_path / "free", joints, yaml)
+    with pytest.raises(ClosureError, match="no box of ±1 mm"):
+        find_workspace(robot)
