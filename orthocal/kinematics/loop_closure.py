@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
 from orthocal.arrays import Array
+from orthocal.effects.loading import robot_effects
 from orthocal.effects.rod_forces import RodForces
 from orthocal.errors import ClosureError
-from orthocal.kinematics.conditions import UseConditions, tool_force
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.continuation import (
     Failures,
     System,
@@ -538,8 +539,10 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
         reach.
     """
     masses, mass_of = np.unique(np.broadcast_to(payload, len(drives)), return_inverse=True)
-    forces = np.array([tool_force(robot, float(m)) for m in masses]).reshape(-1, 3)[mass_of]
-    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), forces))
+    effects = robot_effects(robot)
+    forces = np.array([[e.tool_force(float(m)) for e in effects] for m in masses])
+    on_tool = forces.reshape(-1, len(effects), 3).sum(axis=1)[mass_of]
+    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), on_tool))
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> Failures:
