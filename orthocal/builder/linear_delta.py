@@ -108,17 +108,17 @@ class LinearDelta(Dimensions):
 
     @property
     def box(self) -> tuple[tuple[float, float], ...]:
-        """Limits of the workspace, [m]: the stated one, or a reachable box.
+        """Limits of the workspace, [m]: the stated one, or a box that the rods reach.
 
         The box extends at most half the radius to each side. Its limits are whole centimetres, or
-        whole millimetres on small machines.
+        whole millimetres in small boxes.
         """
         if self.workspace is not None:
             return self.workspace
-        step = 0.01 if self.radius >= 0.1 else 0.001
         half = min(
             0.5 * self.radius, (MAX_RELATIVE_DISTANCE * self.rod - self.radius) / math.sqrt(2.0)
         )
+        step = 0.01 if half >= 0.05 else 0.001
         half = step * math.floor(half / step + 0.5)
         near = max(self.radius - math.sqrt(2.0) * half, 0.0)
         top = min(self.radius, self.travel[1] - math.sqrt(self.rod**2 - near**2))

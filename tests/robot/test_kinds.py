@@ -21,6 +21,7 @@ from orthocal.builder.machine_file import KINDS
 from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthoglide
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.reachable_box import describe_unreachable_box
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.output.text.plan import describe_basis
 from orthocal.planning.candidates import list_candidates
@@ -280,3 +281,11 @@ def test_kinds_and_their_usual_dimensions_are_possible():
         assert kind.kind == name
         assert kind().find_problem() is None
     assert SINGLE.find_problem() is None
+
+
+@pytest.mark.parametrize(("rod", "radius"), [(0.28, 0.14), (0.1277, 0.1), (0.1112, 0.1)])
+def test_the_rods_of_a_delta_reach_its_default_workspace(tmp_path, rod, radius):
+    """Short rods around a large radius leave little room, but some."""
+    delta = LinearDelta(rod=rod, radius=radius, travel=(0.005, 0.56))
+    robot = written(tmp_path, delta)
+    assert describe_unreachable_box(robot, robot.workspace) == ""
