@@ -182,7 +182,7 @@ def _complete_yaml(
             raise RobotError(
                 f"has no line '{drive}: {{zero_mm: ...}}'; expected one for its zero", where=file
             )
-    box = box_text(dimensions.workspace)
+    box = box_text(dimensions.box)
     if box:  # without it, a workspace in the YAML is preserved
         text = _WORKSPACE_KEY.sub("", text)
         place = _ORTHOCAL_KEY.search(text)
