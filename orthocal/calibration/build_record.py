@@ -15,7 +15,6 @@ import scipy
 from orthocal import __version__
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.file import absurd_result
 from orthocal.calibration.recorded_robot import record_robot
 from orthocal.calibration.records import (
     GaugeRecord,
@@ -26,7 +25,7 @@ from orthocal.calibration.records import (
     SolverRecord,
     Versions,
 )
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.diagnostics.deletion import (
     Diagnostics,
     cross_validate_setups,
@@ -144,6 +143,15 @@ def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -
     for p in estimates:
         if not max(abs(p.value), abs(p.linear)) <= LARGEST_NUMBER:
             raise absurd_result(f"{p.name} is {p.value:.3g} {p.unit}", iterations)
+
+
+def absurd_result(problem: str, iterations: int) -> SolverError:
+    """Error for a result with impossible numbers."""
+    return SolverError(
+        f"the result is implausible ({problem}); check readings, sigma_mm, tolerances and bounds",
+        status="absurd result",
+        iterations=iterations,
+    )
 
 
 def _solver_record(fit: Fit) -> SolverRecord:

@@ -288,9 +288,8 @@ class Calibration(CalibrationRecord):
 
     def row_sigma(self, row: ResidualRow) -> float:
         """Standard deviation of a row by the noise of its gauge, [m]."""
-        gauges = {s.name: s.gauge for s in self.setups}
-        noises = {g.name: g.noise for g in self.gauges}
-        noise = noises.get(gauges.get(row.setup, ""), self.noise)
+        gauge = next(s.gauge for s in self.setups if s.name == row.setup)
+        noise = next(g.noise for g in self.gauges if g.name == gauge)
         return noise.sigma * self.noise_factor(row)
 
     def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
