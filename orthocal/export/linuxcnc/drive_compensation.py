@@ -257,6 +257,9 @@ def compensate_with_offsets(
 ) -> tuple[JointCompensation, ...]:
     """Compensation to enter together with the offsets: BACKLASH, or a table that contains it.
 
+    Tables that are kept move with the display of their joints, so that the trim at each position of
+    the slide remains.
+
     Args:
         calibration: The calibration.
         latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
@@ -268,8 +271,18 @@ def compensate_with_offsets(
     """
     active = find_active_compensation(calibration, latched)
     compensation = find_compensation(calibration, latched)
-    compensation = tabulate(calibration, compensation, active, offsets_to_enter(calibration))
-    return round_backlash(compensation, active)
+    offsets = offsets_to_enter(calibration)
+    compensation = tabulate(calibration, compensation, active, offsets)
+    shifts = offsets - calibration.active_offsets
+    moved = []
+    for d, joint, old, shift in zip(
+        calibration.robot.drives, compensation, active, shifts.tolist(), strict=True
+    ):
+        if joint.table is not None and joint.table is old.table and shift:
+            positions = np.array([d.direction * shift, 0.0, 0.0])
+            joint = replace(joint, table=read_only(joint.table + positions))
+        moved.append(joint)
+    return round_backlash(moved, active)
 
 
 def compensate_with_module(
