@@ -32,7 +32,7 @@ from orthocal.sensors.protocol import (
     ToolSensor,
     View,
 )
-from orthocal.units import MM, read_tolerance, show_tolerance, to_mm
+from orthocal.units import MM, read_tolerance, show_mm, show_tolerance, to_mm
 
 LARGEST_MM = 5000.0
 """Largest accepted distance and width, [mm]; a larger one has a wrong unit."""
@@ -96,7 +96,7 @@ class Distance(ToolSensor):
 
     def describe(self) -> str:
         """Short description with the width of the pillar."""
-        beyond = f", over a pillar of {self.width / MM:g} mm" if self.width else ""
+        beyond = f", over a pillar of {show_mm(self.width)} mm" if self.width else ""
         return f"printed distance{beyond}"
 
     @property

@@ -45,7 +45,7 @@ from orthocal.sensors.protocol import (
     place_point,
     triple,
 )
-from orthocal.units import MM, MRAD, read_tolerance, show_tolerance, to_mm
+from orthocal.units import MM, MRAD, read_tolerance, show_mm, show_tolerance, to_mm
 
 ALIGNMENT_STD = 5.0 * MRAD
 """Prior standard deviation of the direction of an artefact aligned by eye, [rad]."""
@@ -265,7 +265,7 @@ class ToolIndicator(ToolSensor):
         a = self.artefact
         words = a.kind.replace("_", " ")
         if a.kind == "gauge_block":
-            words += f" of {a.height / MM:g} mm"
+            words += f" of {show_mm(a.height)} mm"
         along = "" if a.along is None else f" along {a.along}"
         turned = ", turned over" if a.reversed else ""
         return f"indicator at the tool towards {self.direction}, {words}{along}{turned}"
@@ -278,7 +278,7 @@ class ToolIndicator(ToolSensor):
         if a.kind == "gauge_block":
             place = (
                 "Prepare a flat surface on the table. Where the posture is higher, put the gauge "
-                f"block of {a.height / MM:g} mm under the tip."
+                f"block of {show_mm(a.height)} mm under the tip."
             )
         elif a.along is None:
             place = f"Put the {words} on the table, square to the plunger by eye."
