@@ -261,6 +261,9 @@ def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]
         for i, name in enumerate(names):
             if name in names[:i]:
                 yield f"{key}[{i}].name", f"'{name}' occurs twice"
+    for i, gauge in enumerate(record.gauges):
+        if gauge.range is not None and not gauge.range[0] < gauge.range[1]:
+            yield f"gauges[{i}].range", "expected the lowest reading, then the highest"
     values, rank = record.identifiability.singular_values, record.identifiability.rank
     if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
         yield "identifiability.singular_values", "expected positive numbers, the largest first"

@@ -135,6 +135,7 @@ def change(document, keys, value):
         (["robot", "directory"], "a\x00b", "a text contains a control character"),
         (["session", "title"], "\ud800", "half of a surrogate pair"),
         (["setups", 1, "gauge"], "w", "setups[1].gauge: 'w' is not among the file's gauges"),
+        (["gauges", 0, "range"], [0.005, -0.005], "gauges[0].range: expected the lowest reading"),
         (["setups", 0, "active"], [0.0], "setups[0].active: has 1 numbers; expected 3"),
         (["setups", 1, "name"], "xy", "setups[1].name: 'xy' occurs twice"),
         (["sensors", 1, "name"], "w", "sensors[1]: found 'w' in rad; the setups have 'setup.xy.pi"),
