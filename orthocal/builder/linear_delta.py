@@ -217,13 +217,9 @@ class LinearDelta(Dimensions):
             **{f"{k}_rod_b.length": [f"frame.{k}_rod_b_tip.x"] for k in towers},
         }
         return robot_yaml(
-            self.title,
-            letters=towers,
-            zero=self.zero,
-            rod_radius=self.rod_radius,
+            self,
             loops=platform_loops(towers),
             parameters=parameters,
             models={"delta": DELTA_MODEL},
-            workspace=self.box,
             tolerances="offset_mm: 4, translation_mm: 1, rotation_mrad: 5, scale_ppm: 500",
         )

@@ -18,7 +18,7 @@ from orthocal import load_robot
 from orthocal.builder.biglide import Biglide
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.builder.machine_file import KINDS
-from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthoglide
+from orthocal.builder.orthoglide import InclinedOrthoglide, Orthoglide
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.reachable_box import describe_unreachable_box
@@ -173,7 +173,7 @@ def test_the_tool_is_where_pinocchio_closes_the_loops(tmp_path, machine):
 
 def test_orthogonal_slides_make_an_orthoglide(tmp_path, orthoglide):
     """Equal but for the orientation of the world."""
-    machine = InclinedOrthoglide(elevation=ORTHOGONAL)
+    machine = InclinedOrthoglide(elevation=np.arcsin(np.sqrt(1.0 / 3.0)))
     robot = written(tmp_path, machine)
     axes = np.column_stack([leg.direction for leg in machine.legs()])
     assert np.abs(axes.T @ axes - np.eye(3)).max() < KINEMATICS
