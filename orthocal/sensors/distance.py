@@ -13,15 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from pydantic import Field
 
 from orthocal.arrays import Array
-from orthocal.io.documents import Number
 from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.ball_bar import LARGEST_MM, Coordinate, Tolerance
 from orthocal.sensors.mounting import SCALE, ScaleTolerance
 from orthocal.sensors.protocol import (
     Contact,
@@ -34,17 +33,11 @@ from orthocal.sensors.protocol import (
 )
 from orthocal.units import MM, read_tolerance, show_mm, show_tolerance, to_mm
 
-LARGEST_MM = 5000.0
-"""Largest accepted distance and width, [mm]; a larger one has a wrong unit."""
-
-Width = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
-Tolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_MM)]
-
 
 class DistanceKeys(SetupKeys):
     """Keys of a setup of distances, as in a session.yaml."""
 
-    width_mm: Width = 0.0
+    width_mm: Coordinate = 0.0
     """Measured width of the pillar that the calliper includes."""
     width_tolerance_mm: Tolerance = 0.0
     """Tolerance of the width; 0 if it is known."""

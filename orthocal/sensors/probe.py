@@ -19,14 +19,13 @@ from pydantic import Field
 
 from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
+from orthocal.sensors.mounting import Millimetres, Milliradians
 from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View, triple
 from orthocal.sensors.tool_indicator import (
     ALIGNMENT_STD,
     LENGTH_MM,
     Artefact,
     Length,
-    Millimetres,
-    Milliradians,
     Point,
     ToolIndicator,
 )

@@ -32,7 +32,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.direction import direction_vector
-from orthocal.sensors.mounting import SCALE, ScaleTolerance, rotate
+from orthocal.sensors.mounting import SCALE, Millimetres, Milliradians, ScaleTolerance, rotate
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
@@ -64,8 +64,6 @@ Axis = Literal["x", "y", "z"]
 Point = Annotated[
     list[Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]], Field(min_length=3, max_length=3)
 ]
-Millimetres = Annotated[Number, Field(ge=0.0, le=40.0)]
-Milliradians = Annotated[Number, Field(ge=0.0, le=400.0)]
 Length = Annotated[PositiveNumber, Field(le=LARGEST_MM)]
 
 STRAIGHT = ("straight_2", "straight_3")
