@@ -103,12 +103,6 @@ class Calibration(CalibrationRecord):
         """True if there are enough redundant readings for residuals to check the model."""
         return self.redundancy >= MIN_DOF
 
-    @property
-    def suspicious(self) -> tuple[ResidualRow, ...]:
-        """Outliers among the rows, the worst first."""
-        rows = [r for r in self.residuals if abs(r.studentised) > self.critical]
-        return tuple(sorted(rows, key=lambda r: -abs(r.studentised)))
-
     def where(self, row: ResidualRow) -> str:
         """File and line of a row, for messages."""
         file = row.file or self.session.readings_path
