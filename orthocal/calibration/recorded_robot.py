@@ -286,12 +286,11 @@ def _unknown_names(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[st
     """Keys with names of unknown setups, postures, gauges and drives, with the problem."""
     postures, setups = {p.name for p in record.postures}, {s.name for s in record.setups}
     gauges, drives = {g.name for g in record.gauges}, {d.name for d in robot.drives}
-    references = []
+    read, references = {row.setup for row in record.residuals}, []
     for i, setup in enumerate(record.setups):
-        references += [
-            (f"setups[{i}].aligned_at", setup.aligned_at, "postures", postures),
-            (f"setups[{i}].gauge", setup.gauge, "gauges", gauges),
-        ]
+        references.append((f"setups[{i}].aligned_at", setup.aligned_at, "postures", postures))
+        if setup.name in read:
+            references.append((f"setups[{i}].gauge", setup.gauge, "gauges", gauges))
     if record.assessment is not None:
         for key in ("entries", "backlash"):
             references += [
