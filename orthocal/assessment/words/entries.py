@@ -15,6 +15,7 @@ from orthocal.kinematics.conditions import StatedUse
 from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.robot.model import Drive, drive_keys
 from orthocal.session.session import Session
+from orthocal.text import capitalised
 from orthocal.units import UM, format_fixed
 
 HEADLINES: dict[Verdict, str] = {
@@ -150,6 +151,11 @@ def settings_change(*, tool: tuple[float, ...], layer: tuple[float, ...], keep: 
         layer_now_um=layer[0] / UM,
         layer_best_um=layer[1] / UM,
     )
+
+
+def settings_unknown(reason: str) -> Finding:
+    """Finding that a calibration determines no settings of a firmware, with the reason."""
+    return note("settings unknown", f"{capitalised(reason)}.")
 
 
 def must_change(drives: Sequence[str]) -> Finding:
