@@ -28,6 +28,7 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.printer_settings import _find_targets, fit_firmware
+from orthocal.assessment.wording import tool_mm
 from orthocal.calibration.refit import restore_covariances
 from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -108,6 +109,11 @@ def test_walk_of_the_owner_of_a_printer(tmp_path):
     promise = promised((tmp_path / "new" / "README.md").read_text())
     assert np.sqrt(np.mean(after**2)) < PROMISE * promise
     assert promise < 0.05
+    compared = run_orthocal(tmp_path, "compare", "bed", "--models", "delta").stdout
+    fit = fit_firmware(load_calibration(tmp_path / "one"), firmware)
+    row = next(line.split() for line in compared.splitlines() if line.split()[:1] == ["full"])
+    errors = [tool_mm(fit.expect_tool(e)) for e in (fit.now, fit.new)]
+    assert " ".join(row).startswith(f"full {' '.join(errors)} ")
     (tmp_path / "part.gcode").write_text("G21 G90\nG1 X9 F600\n")
     for command in (  # which know no settings of a firmware
         ("correct", "one", "part.gcode", "--out", "corrected.gcode"),
