@@ -109,7 +109,7 @@ def test_walk_of_the_owner_of_a_printer(tmp_path):
     promise = promised((tmp_path / "new" / "README.md").read_text())
     assert np.sqrt(np.mean(after**2)) < PROMISE * promise
     assert promise < 0.05
-    compared = run_orthocal(tmp_path, "compare", "bed", "--models", "delta").stdout
+    compared = run_orthocal(tmp_path, "compare", "bed", "--models", "full").stdout
     fit = fit_firmware(load_calibration(tmp_path / "one"), firmware)
     row = next(line.split() for line in compared.splitlines() if line.split()[:1] == ["full"])
     errors = [tool_mm(fit.expect_tool(e)) for e in (fit.now, fit.new)]
