@@ -174,6 +174,32 @@ class Artefact:
     """Coordinate of the tool centre point along the plunger while the tip touches the plane beside
     the block, [m]."""
 
+    @property
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Direction and errors, if their standard deviation is above 0.
+
+        Both arms of a square share its yaw. A square that is turned over has another yaw.
+        """
+        owner = None if self.name is None else f"{self.kind}.{self.name}"
+        placement = f"{owner}.reversed" if owner and self.reversed else owner
+        arm = None if owner is None else f"{owner}.{self.along}"
+        is_edge = self.along is not None
+        forms = STRAIGHT if is_edge else flat_terms(self.form_degree)
+        share = np.array([1.0 if is_edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
+        form_std = self.form_std * share / np.linalg.norm(share)
+        yaw_owner = placement if self.kind == "square" else None
+        parameters = (
+            NuisanceParameter("yaw", "rad", self.direction_std, yaw_owner),
+            NuisanceParameter("roll", "rad", self.direction_std),
+            NuisanceParameter("square", "rad", self.square_std, owner),
+            *(
+                NuisanceParameter(name, "m", float(std), arm)
+                for name, std in zip(forms, form_std, strict=True)
+            ),
+            NuisanceParameter("height", "m", self.height_std),
+        )
+        return tuple(p for p in parameters if p.prior_std > 0.0)
+
 
 @dataclass(frozen=True, slots=True)
 class ToolIndicator(ToolSensor):
@@ -327,34 +353,8 @@ class ToolIndicator(ToolSensor):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and errors of the artefact and scale of the dial, if their std is above 0."""
-        return self._artefact_parameters()
-
-    def _artefact_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Nuisance parameters of the artefact and the dial.
-
-        Both arms of a square share its yaw. A square that is turned over has another yaw.
-        """
-        a = self.artefact
-        owner = None if a.name is None else f"{a.kind}.{a.name}"
-        placement = f"{owner}.reversed" if owner and a.reversed else owner
-        arm = None if owner is None else f"{owner}.{a.along}"
-        is_edge = a.along is not None
-        forms = STRAIGHT if is_edge else flat_terms(a.form_degree)
-        share = np.array([1.0 if is_edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
-        form_std = a.form_std * share / np.linalg.norm(share)
-        yaw_owner = placement if a.kind == "square" else None
-        parameters = (
-            NuisanceParameter("yaw", "rad", a.direction_std, yaw_owner),
-            NuisanceParameter("roll", "rad", a.direction_std),
-            NuisanceParameter("square", "rad", a.square_std, owner),
-            *(
-                NuisanceParameter(name, "m", float(std), arm)
-                for name, std in zip(forms, form_std, strict=True)
-            ),
-            NuisanceParameter("height", "m", a.height_std),
-            NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
-        )
-        return tuple(p for p in parameters if p.prior_std > 0.0)
+        scale = NuisanceParameter("scale", "1", self.scale_std, of_gauge=True)
+        return (*self.artefact.nuisance_parameters, *((scale,) * (self.scale_std > 0.0)))
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Reading with the gauge zero at 0, [m]."""
