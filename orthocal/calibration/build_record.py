@@ -83,6 +83,7 @@ def assemble_calibration(
     variances[2] += (bias[:, unmodelled_errors.scaled] ** 2).sum(axis=1)
     estimates = _estimates(fit, np.sqrt(variances))
     _require_possible(estimates, fit.iterations)
+    known = [hold_parameter(session.robot, *value) for value in problem.fixed.items()]
     diagnostics = diagnose_readings(fit)
     return Calibration(
         robot_record=record_robot(session),
@@ -90,7 +91,7 @@ def assemble_calibration(
         model=problem.selection.label,
         prior=bool(problem.machine_selection.prior.any()),
         solver=_solver_record(fit),
-        parameters=(*estimates[:n], *_held_parameters(problem)),
+        parameters=(*estimates[:n], *known),
         sensors=estimates[n:],
         model_covariance=read_only(covariances[0][:n, :n]),
         noise_covariance=read_only(covariances[1][:n, :n]),
@@ -110,12 +111,6 @@ def assemble_calibration(
         versions=_versions(),
         robot=session.robot,
     )
-
-
-def _held_parameters(problem: CalibrationProblem) -> list[ParameterEstimate]:
-    """Records of the known parameters, which are not estimated."""
-    robot = problem.session.robot
-    return [hold_parameter(robot, name, value) for name, value in problem.fixed.items()]
 
 
 def _separate_noise(fit: Fit) -> float | None:

@@ -86,7 +86,10 @@ def calibration_json(calibration: Calibration) -> str:
         SolverError: If it could not be loaded again; names the impossible number.
     """
     document = calibration_document(calibration)
-    _require_loadable(document, calibration)
+    try:
+        _read_document(document, "calibration.json", robot=calibration.robot)
+    except CalibrationFileError as e:
+        raise absurd_result(str(e), calibration.solver.iterations) from None
     return format_json(document)
 
 
@@ -100,14 +103,6 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     require_suffix(file, ".json", OTHER_KINDS)
     write_file(file, calibration_json(calibration))
     return file
-
-
-def _require_loadable(document: dict[str, Any], calibration: Calibration) -> None:
-    """Refuse a result that could not be loaded from its file."""
-    try:
-        _read_document(document, "calibration.json", robot=calibration.robot)
-    except CalibrationFileError as e:
-        raise absurd_result(str(e), calibration.solver.iterations) from None
 
 
 def _read_document(
