@@ -170,6 +170,16 @@ def test_a_size_that_makes_no_machine_is_named_by_its_key(tmp_path, old, new, me
     assert (folder / "mine.urdf").read_text() == before
 
 
+def test_a_description_that_is_not_utf_8_is_refused_and_stays(tmp_path):
+    make_robot(SMALL, tmp_path / "mine")
+    described = tmp_path / "mine/mine.yaml"
+    content = described.read_bytes() + "# geprüft\n".encode("latin-1")
+    described.write_bytes(content)
+    with pytest.raises(RobotError, match=r"mine\.yaml: is not UTF-8 text"):
+        remake_robot(tmp_path / "mine")
+    assert described.read_bytes() == content
+
+
 def test_a_description_without_a_place_for_a_size_is_named(tmp_path):
     folder = tmp_path / "mine"
     make_robot(SMALL, folder)
