@@ -42,7 +42,7 @@ from orthocal.measurement.motion.approach import (
     approach_share,
 )
 from orthocal.measurement.motion.guidance import shown_joints
-from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.motion.motion import plan_motion, state_program_approaches
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.output.sheet.page import sheet_files
 from orthocal.session.session import Conditions, Gauge, Reading
@@ -217,6 +217,18 @@ def test_an_approach_is_no_longer_than_the_dial_allows(small, half, backlash, le
     for motion in plan_motion(session):
         for stop in motion.stops:
             assert stop.drives - stop.approach_drives == pytest.approx([length] * 3)
+
+
+@pytest.mark.parametrize(("half", "approach"), [(0.4e-3, "ppp"), (5e-3, "nnn")])
+def test_readings_without_an_approach_get_that_of_the_program(small, half, approach):
+    """A drive ends 1 mm below its shortest coordinate: only a short approach is from below."""
+    robot = with_effects(small.robot, ["backlash"])
+    least = min(p.drives[0] for p in small.postures.values())
+    robot = replace(robot, drives=(replace(robot.drives[0], lower=least - 1e-3), *robot.drives[1:]))
+    session = replace(small, robot=robot).with_gauge(replace(small.gauge, range=(-half, half)))
+    assert {r.approach for r in state_program_approaches(session).readings} == {approach}
+    for motion in plan_motion(session):
+        assert {s.approach for s in motion.stops} == {approach}
 
 
 @pytest.fixture(scope="module")
@@ -574,6 +586,14 @@ def test_a_ball_bar_keeps_its_length_between_its_readings(bar):
         assert [signs[k] for k in stop.approach] == np.where(known, np.sign(change), 0.0).tolist()
         assert np.linalg.norm(stop.approach_point - stop.point) == pytest.approx(0.5 * MM, rel=1e-4)
         assert stop.posture != before.posture
+
+
+def test_readings_of_a_bar_without_an_approach_get_that_of_their_path(bar):
+    session = replace(bar, robot=with_effects(bar.robot, ["backlash"]))
+    stated = state_program_approaches(session)
+    (motion,) = plan_motion(stated)
+    read = [s.approach for s in motion.stops if s.role == "reading"]
+    assert [r.approach for r in stated.readings] == read
 
 
 @pytest.mark.parametrize("aligned_at", ["a", "c"])

@@ -11,7 +11,7 @@ conditions: the drives reach it, the tip stays on the rod, and the dial stays in
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -172,15 +172,8 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    first = {setup: rows[0][1] for setup, rows in rows_by_setup.items()}
     guided = _guided_setups(session)
-    additional_alignments = {
-        aligned_at[s]
-        for s, r in first.items()
-        if s not in guided and aligned_at[s] != (r.minus or r.posture)
-    }
-    unguided = [r for r in session.readings if r.setup not in guided]
-    stop_at = _find_approaches(session, unguided, additional_alignments) if unguided else {}
+    stop_at = _find_approaches(session, _unguided_places(session, guided))
     motions = []
     for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
         if setup in guided:
@@ -194,6 +187,41 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows_by_setup), alignment, tuple(stops)))
     return tuple(motions)
+
+
+def common_approach(session: Session) -> str | None:
+    """Approach of programs in postures without a stated one; None if no common one is possible.
+
+    It is also None if no effect of the machine depends on the approach.
+    """
+    places = _unguided_places(session, _guided_setups(session))
+    if not places or not usual_approaches(session.robot):
+        return None
+    for letter in "pn":
+        if _free_failure(_begin_approaches(session, places, letter)[1]) is None:
+            return letter * len(session.robot.drives)
+    return None
+
+
+def state_program_approaches(session: Session) -> Session:
+    """Session in which readings without a stated approach get that of programs, if possible.
+
+    Raises:
+        SessionError: As `state_path_approaches`.
+    """
+    guided = _guided_setups(session)
+    if any(r.setup in guided and r.approach is None for r in session.readings):
+        session = state_path_approaches(session)
+    common = common_approach(session)
+    if common is None:
+        return session
+    readings = tuple(
+        replace(r, conditions=replace(r.conditions or Conditions(), approach=common))
+        if r.minus is None and r.approach is None
+        else r
+        for r in session.readings
+    )
+    return replace(session, readings=readings)
 
 
 def _refuse_pairs(session: Session) -> None:
@@ -242,8 +270,10 @@ def state_path_approaches(session: Session) -> Session:
 Path = Callable[[Array, Array], Array]
 """Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
 
-Approaches = dict[tuple[str, str | None], Stop]
-"""Stops by posture and stated approach, which is None if not stated."""
+Place = tuple[str, str | None]
+"""Posture and stated approach, which is None if not stated."""
+
+Approaches = dict[Place, Stop]
 
 
 def _guided_setups(session: Session) -> dict[str, Path]:
@@ -302,9 +332,20 @@ def _stops_on_path(session: Session, setup: str) -> Approaches:
     return stops
 
 
-def _find_approaches(
-    session: Session, readings: Sequence[Reading], alignment: set[str]
-) -> Approaches:
+def _unguided_places(session: Session, guided: Collection[str]) -> list[Place]:
+    """Postures to read or to align a gauge, with stated approaches, of setups without a path."""
+    ordered = (session.readings[i] for i in order_of_measurement(session.readings))
+    unguided = [r for r in ordered if r.setup not in guided]
+    first = {r.setup: r.minus or r.posture for r in reversed(unguided)}
+    aligned_at = session.alignment_postures
+    places: set[Place] = {(aligned_at[s], None) for s, p in first.items() if aligned_at[s] != p}
+    places |= {(r.posture, r.approach) for r in unguided}
+    places |= {(r.minus, None) for r in unguided if r.minus is not None}
+    order = {name: i for i, name in enumerate(session.postures)}
+    return sorted(places, key=lambda place: (order[place[0]], place[1] or ""))
+
+
+def _find_approaches(session: Session, places: Sequence[Place]) -> Approaches:
     """Stops to read or to align a gauge, each at the end of its approach.
 
     Postures without a stated approach are all approached from one side. The same side applies to
@@ -312,22 +353,18 @@ def _find_approaches(
 
     Args:
         session: The session.
-        readings: The readings to approach.
-        alignment: Names of the alignment postures.
+        places: Postures and stated approaches.
 
     Raises:
         SessionError: If neither side is possible in all these postures, or a posture cannot be
             approached as stated.
     """
-    wanted: set[tuple[str, str | None]] = {(name, None) for name in alignment}
-    wanted |= {(r.posture, r.approach) for r in readings}
-    wanted |= {(r.minus, None) for r in readings if r.minus is not None}
-    order = {name: i for i, name in enumerate(session.postures)}
-    places = sorted(wanted, key=lambda place: (order[place[0]], place[1] or ""))
+    if not places:
+        return {}
     refused: list[ClosureError] = []
     for letter in "pn":
         stops, failures = _begin_approaches(session, places, letter)
-        first = next((e for (_, s), e in failures.items() if s is None or "u" in s), None)
+        first = _free_failure(failures)
         if first is not None:
             refused.append(first)
             continue
@@ -345,9 +382,14 @@ def _find_approaches(
     )
 
 
+def _free_failure(failures: Mapping[Place, ClosureError]) -> ClosureError | None:
+    """First error of a place where the side of a drive is not stated; None without one."""
+    return next((e for (_, stated), e in failures.items() if "u" in (stated or "u")), None)
+
+
 def _begin_approaches(
-    session: Session, places: Sequence[tuple[str, str | None]], letter: str
-) -> tuple[Approaches, dict[tuple[str, str | None], ClosureError]]:
+    session: Session, places: Sequence[Place], letter: str
+) -> tuple[Approaches, dict[Place, ClosureError]]:
     """Stops of postures with their approaches.
 
     Args:
