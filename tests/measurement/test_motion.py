@@ -670,6 +670,22 @@ def warnings_of(session):
 
 
 @pytest.mark.parametrize(
+    "sensor",
+    [
+        "{sensor: probe, direction: -z, surface: plane, zero: free}",
+        "{sensor: points, target_mm: [0, 0, -40], zero: free}",
+    ],
+)
+def test_an_instrument_without_a_dial_has_no_bezel_and_no_plunger(directory, sensor):
+    plan = f"{PLAN[: PLAN.index('setups:')]}setups:\n  s: {sensor}\n"
+    (directory / "free.yaml").write_text(plan)
+    files = sheet_files(load_plan(directory / "free.yaml"))
+    assert len(files) == 2  # the sheet and one program
+    for text in files.values():
+        assert not re.search(r"set the dial|bezel|plunger|the hand must", text)
+
+
+@pytest.mark.parametrize(
     ("lengths", "shown", "beyond"),
     [
         ((49.2, 50.8), ["-0.80", "+0.80", "-0.80"], ""),

@@ -12,7 +12,7 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.observations import drive_table
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.protocol import Contact, has_dial
 from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import MM
 
@@ -93,9 +93,12 @@ def range_of_expected(gauge: Gauge, *, differences: bool) -> tuple[float, float]
 
 def set_dial(session: Session, setup: str) -> str:
     """Instruction for setting the gauge zero of a setup."""
-    gauge = session.gauges[session.setups[setup].gauge]
-    if session.setups[setup].zero == "known":
+    of_setup = session.setups[setup]
+    gauge = session.gauges[of_setup.gauge]
+    if of_setup.zero == "known":
         return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
+    if not has_dial(of_setup.sensor):
+        return "The gauge zero is not set: the calibration estimates it."
     travel = ""
     if gauge.range is not None:
         travel = f", about {gauge.half_range / MM:g} mm"

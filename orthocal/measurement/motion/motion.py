@@ -652,6 +652,7 @@ def _predict(
         )
     )
     _, contact = locate_contacts(sampled)[setup]
+    sensor = sampled.setups[setup].sensor
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
     gauge, differences = sampled.gauges[sampled.setups[setup].gauge], stops[first].role != "reading"
@@ -663,7 +664,7 @@ def _predict(
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
-        if i > 0:  # the gauge is mounted at the first stop
+        if i > 0 and has_dial(sensor):  # the gauge is mounted at the first stop
             start = end - len(paths[i].points)
             on_path = predicted[start:end]
             problems = [p for p in contact.problems[start:end] if p]

@@ -27,7 +27,7 @@ from orthocal.measurement.motion.motion import SetupMotion, Stop
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import BallIndicator
-from orthocal.sensors.protocol import Sensor, mounting_steps
+from orthocal.sensors.protocol import Sensor, has_dial, mounting_steps
 from orthocal.session.session import Session
 from orthocal.text import comment_safe, shorten
 from orthocal.units import MM, format_fixed
@@ -166,8 +166,10 @@ def write_program(
     ]
     mount = _mount(sensor, session.distinguish_gauge(of_setup.gauge))
     for i, stop in enumerate(stops):
-        zero = "0" if stop.role == "subtracted" else ""
-        if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
+        zero = ""
+        if has_dial(sensor) and stop.role == "subtracted":
+            zero = "0"
+        elif has_dial(sensor) and stop is motion.stops[0] and of_setup.zero == "free":
             zero = dial_zero(gauge)
         actions = (
             mount if i == 0 else "",
