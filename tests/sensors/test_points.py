@@ -102,6 +102,33 @@ def test_grossly_wrong_points_do_not_move_the_station(wrong):
     assert fit_station(points, targets) != expected
 
 
+@pytest.mark.parametrize(
+    ("keys", "name"),
+    [
+        ("", "z_mm"),
+        (f", covariance_um2: {COVARIANCE_UM2}", r"the coordinate along principal axis \d"),
+    ],
+)
+def test_a_coordinate_out_of_range_is_named(tmp_path, keys, name):
+    """Most points are missing: those that are read decide between a wrong unit and one mistake."""
+    plan = grid(tmp_path, keys, side=2)
+    number_by_posture = {p: 100.0 for p in [*plan.postures][:3]}
+    number_by_posture["p2"] = 4e7
+    rows = (f"track,{p},1,2,{number_by_posture.get(p)}" for p in plan.postures)
+    rows = (row.replace(",1,2,None", ",,,") for row in rows)
+    text = "setup,posture,x_mm,y_mm,z_mm\n" + "\n".join(rows)
+    (tmp_path / "readings.csv").write_text(text)
+    (tmp_path / "plan.yaml").write_text(
+        (tmp_path / "plan.yaml").read_text() + "readings: readings.csv\n"
+    )
+    wrong = []
+    load_plan(tmp_path / "plan.yaml", wrong=wrong)
+    (error,) = wrong
+    assert error.where.endswith(":4")
+    assert re.match(name, error.problem)
+    assert "decimal point" in error.problem
+
+
 def tracked(folder):
     """Session of a tracker at STATION, and its points, shape (27, 3), [mm]."""
     plan = grid(folder)

@@ -187,6 +187,14 @@ def point_cells(
     return cells
 
 
+def value_name(setup: str) -> str:
+    """Column of the readings of a setup, or principal axis of the covariance of its points."""
+    axis = setup.partition("[")[2][:1]
+    if axis.isdigit():
+        return f"the coordinate along principal axis {axis}"
+    return f"{axis or 'reading'}_mm"
+
+
 def is_of_row(name: str) -> bool:
     """True for a setup that exists for the covariance of rows."""
     return len(name.partition("[")[2]) > len("x]")
