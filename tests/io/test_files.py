@@ -177,6 +177,14 @@ def test_looking_whether_a_folder_can_be_written_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_cannot_be_cleaned_up_does_not_prevent_writing(tmp_path):
+    """As the file of another user in /tmp; a directory, because the tests may run as root."""
+    left = tmp_path / f".orthocal-{2**22}-{16 * '0'}.tmp"
+    left.mkdir()
+    write_file(tmp_path / "file", "text")
+    assert sorted(f.name for f in tmp_path.iterdir()) == [left.name, "file"]
+
+
 def test_what_a_killed_run_left_is_cleaned_up_by_the_next(tmp_path):
     done = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"],
                           capture_output=True, text=True, check=True)  # fmt: skip
