@@ -106,7 +106,7 @@ def _read_offsets(text: str, drives: Sequence[Drive]) -> tuple[float, ...] | Non
     match = EXPORTED_OFFSETS.search(text)
     stated = {} if match is None else dict(OFFSETS_OF_UNIT.findall(match[1]))
     try:
-        values = {unit: [float(v) for v in list_.split(",")] for unit, list_ in stated.items()}
+        values = {unit: [float(v) for v in numbers.split(",")] for unit, numbers in stated.items()}
     except ValueError:
         return None
     names = [d.joint_unit for d in drives]
