@@ -21,7 +21,7 @@ from orthocal.arrays import Array
 from orthocal.effects.loading import load_robot_content, with_adjustments, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.measurement.files.write_session import session_document
+from orthocal.measurement.files.write_session import session_document, session_tables
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 
@@ -118,10 +118,12 @@ def _session_record(session: Session) -> dict[str, Any]:
         + (f",{r.conditions}" if r.conditions else "")
         for r in session.readings
     )
+    tables = session_tables(session)
     return {
         "robot": {"name": session.robot.name, "sha256": session.robot.sha256},
         "session": {**session_document(session), "robot": session.robot.name},
         "readings": hashlib.sha256(rows.encode()).hexdigest(),
+        **{name: hashlib.sha256(text.encode()).hexdigest() for name, text in tables.items()},
     }
 
 
