@@ -22,6 +22,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
 from orthocal.sensors.points import fit_station
+from orthocal.study.sensitivity import build_sensitivity_study
 from orthocal.units import MM
 
 SIGMA = 10e-6
@@ -237,6 +238,10 @@ def test_a_row_can_state_its_covariance(tmp_path):
     again = load_session(tmp_path / "again")
     np.testing.assert_allclose(again.values, found.values, atol=2e-9)
     assert list(again.setups) == list(found.setups)
+    # along the same axes, the values of a study do not show the covariance
+    file.write_text(file.read_text().replace(",25,36,49,", ",25,64,49,"))
+    sessions = (found, load_session(file.parent))
+    assert len({build_sensitivity_study(s, ["*.offset"]).digest for s in sessions}) == 2
 
 
 @pytest.mark.slow
