@@ -352,7 +352,7 @@ def build_linearisation_study(
 def _idealise(session: Session) -> Session:
     """Session of the same postures with readings of 0, exact mountings and no active offsets.
 
-    Errors are those that the active offsets do not correct, because equations are linear about them.
+    Errors are those that the active offsets do not correct: equations are linear about them.
     """
     if session.active_offsets.any():
         session = session.with_controller(np.zeros(len(session.robot.drives)))
