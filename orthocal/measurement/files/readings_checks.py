@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -26,6 +26,7 @@ from orthocal.sensors.protocol import (
     largest_reading,
     reads_pairs,
 )
+from orthocal.session.completeness import require_name
 from orthocal.session.differences import IndependentReadings
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten, spans
@@ -246,16 +247,6 @@ class _AcceptedReadings:
                 f"without one, as in line {self._first_line_by_zoned[not zoned]}",
                 where=row.where,
             )
-
-
-def require_name(name: str, names: Collection[str], noun: str, *, where: str) -> None:
-    """Refuse a name that the session does not have.
-
-    Raises:
-        SessionError: If the name is unknown; lists the names of the session.
-    """
-    if name not in names:
-        raise SessionError(f"'{name}' is not a {noun}; {noun}s: {', '.join(names)}", where=where)
 
 
 def _check_names(row: RawReading, session: Session, points: PointRows) -> None:
