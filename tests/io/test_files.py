@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -22,6 +23,7 @@ from orthocal.io.files import (
     write_file,
     write_files,
 )
+from orthocal.io.journal import open_journal_file
 
 NO_FILE = "is a device, a pipe or a socket; expected a file"
 
@@ -307,3 +309,22 @@ def test_content_of_a_robot_file_behind_a_link_is_not_quoted(kind, root, secret,
         load_robot(folder)
     assert "combination" not in str(caught.value)
     assert caught.value.where.startswith(str(file))
+
+
+def test_a_line_that_does_not_fit_leaves_nothing_in_a_journal(tmp_path, monkeypatch):
+    """The disk is full in the middle of the line, and has space for the next one."""
+    write = os.write
+
+    def write_the_beginning(descriptor, data):
+        if len(data) < 10:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(descriptor, data[:5])
+
+    with open_journal_file(tmp_path / "journal", busy="busy") as journal:
+        journal.append({"a": 1})
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "write", write_the_beginning)
+            with pytest.raises(OutputError, match="No space left"):
+                journal.append({"b": "long"})
+        journal.append({"c": 2})
+    assert (tmp_path / "journal").read_text() == '{"a": 1}\n{"c": 2}\n'
