@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -19,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, SessionError, UnreachablePathError
+from orthocal.errors import ClosureError, OrthocalError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
@@ -204,24 +205,29 @@ def common_approach(session: Session) -> str | None:
 
 
 def state_program_approaches(session: Session) -> Session:
-    """Session in which readings without a stated approach get that of programs, if possible.
-
-    Raises:
-        SessionError: As `state_path_approaches`.
-    """
+    """Session in which readings without a stated approach get that of programs, if possible."""
     guided = _guided_setups(session)
     if any(r.setup in guided and r.approach is None for r in session.readings):
-        session = state_path_approaches(session)
+        with suppress(OrthocalError):  # no program can be made
+            session = state_path_approaches(session)
     common = common_approach(session)
-    if common is None:
-        return session
-    readings = tuple(
-        replace(r, conditions=replace(r.conditions or Conditions(), approach=common))
-        if r.minus is None and r.approach is None
-        else r
-        for r in session.readings
-    )
-    return replace(session, readings=readings)
+    return _with_approaches(session, lambda _, r: r.approach or common)
+
+
+def _with_approaches(session: Session, find: Callable[[int, Reading], str | None]) -> Session:
+    """Session whose readings in one posture have other approaches.
+
+    Args:
+        session: The session.
+        find: Function from the index of a reading and the reading to its approach; None for the
+            stated one.
+    """
+    readings = list(session.readings)
+    for i, r in enumerate(readings):
+        if r.minus is None and (approach := find(i, r)) not in (None, r.approach):
+            conditions = replace(r.conditions or Conditions(), approach=approach)
+            readings[i] = replace(r, conditions=conditions)
+    return replace(session, readings=tuple(readings))
 
 
 def _refuse_pairs(session: Session) -> None:
@@ -251,20 +257,15 @@ def state_path_approaches(session: Session) -> Session:
     guided = _guided_setups(session)
     if not guided or not usual_approaches(session.robot):
         return session
-    approaches = {
-        (m.setup, stop.line): stop.approach
-        for m in plan_motion(session)
-        if m.setup in guided
-        for stop in m.stops
+    rows = enumerate(session.readings)
+    of_guided = tuple(replace(r, line=i) for i, r in rows if r.setup in guided)
+    approach_by_row = {
+        stop.line: stop.approach
+        for motion in plan_motion(replace(session, readings=of_guided))
+        for stop in motion.stops
         if stop.role == "reading"
     }
-    readings = tuple(
-        replace(r, conditions=replace(r.conditions or Conditions(), approach=approaches[key]))
-        if (key := (r.setup, i + FIRST_LINE if r.line is None else r.line)) in approaches
-        else r
-        for i, r in enumerate(session.readings)
-    )
-    return replace(session, readings=readings)
+    return _with_approaches(session, lambda i, _: approach_by_row.get(i))
 
 
 Path = Callable[[Array, Array], Array]
