@@ -54,6 +54,8 @@ def guide(session: Session) -> Guidance:
     """
     robot = session.robot
     commanded = drive_table(session) + session.active_offsets
+    aligned_at = session.alignment_postures
+    alignment = tuple(Reading(setup, posture) for setup, posture in aligned_at.items())
     closure = nominal_closure(robot)
     passive = closure.close(commanded, names=list(session.postures))
     tool: dict[str, Array] = {}
@@ -63,15 +65,9 @@ def guide(session: Session) -> Guidance:
         joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
         passive=dict(zip(session.postures, passive, strict=True)),
         tool=tool,
-        contacts=locate_contacts(with_alignment(session)),
-        aligned_at=session.alignment_postures,
+        contacts=locate_contacts(replace(session, readings=(*session.readings, *alignment))),
+        aligned_at=aligned_at,
     )
-
-
-def with_alignment(session: Session) -> Session:
-    """Session with an additional reading of each setup in its alignment posture."""
-    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
-    return replace(session, readings=(*session.readings, *extra))
 
 
 def dial_zero(gauge: Gauge) -> str:
