@@ -60,6 +60,8 @@ class PointRows:
 
     def __init__(self, session: Session) -> None:
         self.session = session
+        self.names = list(dict.fromkeys(map(base_name, session.setups)))
+        """Names of all setups as in the files."""
         self.setups: dict[str, Setup] = dict(session.setups)
         """All setups by name, additional ones included."""
         self.gauges: dict[str, Gauge] = dict(session.gauges)
@@ -71,11 +73,6 @@ class PointRows:
         for name, setup in self.setups.items():
             if isinstance(setup.sensor, Points):
                 self._setups_by_base.setdefault(base_name(name), []).append(name)
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all setups as in the files."""
-        return list(dict.fromkeys(map(base_name, self.session.setups)))
 
     @property
     def has_points(self) -> bool:
