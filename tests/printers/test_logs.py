@@ -394,6 +394,8 @@ def test_options_of_tables_are_refused_for_a_log(tmp_path):
         done = run_orthocal(tmp_path, "import", "printer.cfg", "bed")
         assert done.returncode == code
     assert "exists already; choose another directory" in done.stderr
+    done = run_orthocal(tmp_path, "import", "printer.cfg", "bed/printer")
+    assert (done.returncode, "directory of a robot" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("height", [-17.2, 0.0, 4.0])

@@ -506,11 +506,11 @@ class RecordingText:
         if warnings:
             following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
         elif session.controller_offsets is not None and any(session.controller_offsets):
-            together = calibrate_command([Path("EARLIER"), Path(path)], {})
+            joint = calibrate_command([Path("EARLIER"), Path(path)], {})
             following = (
                 "Next: validate the offsets that were entered, by their calibration,\n"
                 f"  orthocal validate CALIBRATION {command}\n"
-                f"or calibrate all sessions together:\n  {together}"
+                f"or calibrate all sessions together:\n  {joint}"
             )
             if session.offsets_from is not None:
                 entered = quote_path(session.offsets_from)
