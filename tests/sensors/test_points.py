@@ -22,6 +22,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
 from orthocal.sensors.points import fit_station
+from orthocal.study.bootstrap import build_bootstrap_study
 from orthocal.study.sensitivity import build_sensitivity_study
 from orthocal.units import MM
 
@@ -101,6 +102,14 @@ def test_grossly_wrong_points_do_not_move_the_station(wrong):
     mistyped[wrong[1:], 0] += 0.1
     assert fit_station(mistyped, targets) == expected
     assert fit_station(points, targets) != expected
+
+
+def test_points_in_one_cycle_cannot_be_resampled_by_cycles(tmp_path):
+    """The message names the setup of the file."""
+    session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=3).session
+    with pytest.raises(SessionError, match="one cycle") as refused:
+        build_bootstrap_study(session, "offsets", by="cycles", draws=2)
+    assert refused.value.where.endswith("setups.track")
 
 
 @pytest.mark.parametrize(
