@@ -252,6 +252,7 @@ RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
         ("hello\n", "log.txt", "no known firmware"),
         (KLIPPER + MARLIN, "log.txt", "several"),
         (KLIPPER.replace("delta_radius: 140.000000", "delta_radius: x"), "[printer]", "'x'"),
+        (KLIPPER.replace("kinematics: delta", "kinematics: corexy"), "[printer] kin", "'corexy'"),
         (KLIPPER.replace("microsteps: 16", "m: 1"), "[stepper_a]", "microsteps"),
         (KLIPPER.replace("arm_length: 280.0", "arm_length: 1620.0", 1), "log.txt", "1620"),
         (KLIPPER.replace("height1_pos = ", "height1_pos = 1,"), "height1_pos", "4 numbers"),
