@@ -26,7 +26,7 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     if not issubclass(offered, Effect) or offered.name != name:
         raise TypeError(f"{offered.__qualname__} is not an Effect with name = '{name}'")
     if unknown := [c for c in offered.conditions if c not in get_args(Condition)]:
-        expected = ", ".join(get_args(Condition))
+        expected = f"expected one of {', '.join(get_args(Condition))}"
         raise TypeError(f"{offered.__qualname__}.conditions: found {unknown[0]!r}; {expected}")
     return offered
 
