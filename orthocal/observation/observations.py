@@ -165,26 +165,21 @@ class Observations:
         One entry of each group of differences has the value 0.
         """
         result = np.zeros(self.size)
+        pending = np.flatnonzero(self.minus >= 0)
+        result[self.plus] = np.where(self.minus < 0, rows, 0.0)
+        _, first = np.unique(self.zero[self.plus[pending]], return_index=True)
         done = np.zeros(self.size, dtype=bool)
-        single = self.minus < 0
-        result[self.plus[single]] = rows[single]
-        done[self.plus[single]] = True
-        pending = list(np.flatnonzero(~single))
-        while pending:
-            postponed = []
-            for row in pending:
-                p, m = self.plus[row], self.minus[row]
-                if done[p]:
-                    result[m] = result[p] - rows[row]
-                elif done[m]:
-                    result[p] = result[m] + rows[row]
-                else:
-                    postponed.append(row)
-                    continue
-                done[p] = done[m] = True
-            if len(postponed) == len(pending):  # start a new group
-                done[self.minus[postponed[0]]] = True
-            pending = postponed
+        done[self.minus[pending[first]]] = True
+        while pending.size:  # rows of which one entry has its value
+            forward, backward = done[self.plus[pending]], done[self.minus[pending]]
+            for known, entries, others, sign in (
+                (forward, self.minus, self.plus, -1.0),
+                (backward, self.plus, self.minus, 1.0),
+            ):
+                solved = pending[known]
+                result[entries[solved]] = result[others[solved]] + sign * rows[solved]
+                done[entries[solved]] = True
+            pending = pending[~(forward | backward)]
         return result
 
 
