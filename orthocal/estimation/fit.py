@@ -22,14 +22,13 @@ from orthocal.estimation.weighting import (
     NoiseEstimate,
     Scatter,
     first_sigma,
-    initial_sigma,
     initial_sigmas,
     leverages,
     split_by_gauge,
     with_initial_noise,
     with_repeatability,
 )
-from orthocal.observation.gauge_noise import SMALLEST_SIGMA
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA, assumed_sigma
 from orthocal.statistics.chance import COVERAGE, coverage_factor
 from orthocal.statistics.information import (
     Information,
@@ -101,10 +100,10 @@ class Fit:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a reading of the first gauge, [m]; the initial one if unknown."""
+        """Standard deviation of a reading of the first gauge, [m]; the assumed one if unknown."""
         if math.isfinite(self.noise.sigma):
             return floored_sigma(self.noise)
-        return initial_sigma(self.groups[0].gauge, (math.nan, 0))
+        return assumed_sigma(self.groups[0].gauge)
 
     @property
     def loss(self) -> Loss:
@@ -336,6 +335,13 @@ def _solve_with_noise(
             mirrored=compared,
         )
         iterations += solution.iterations
+    if not math.isfinite(estimated) and _depends_on_sigma(program):
+        # the last sigma was that of residuals with too few degrees of freedom
+        sigma = float(initial[groups[0].entries][0])
+        solution = program.solve(sigma=sigma, start=solution.theta, start_passive=solution.passive)
+        iterations += solution.iterations
+        at_assumed = _evaluate(program, solution, sigma, groups, initial)
+        evaluation = replace(at_assumed, noises=evaluation.noises)
     if several:  # the noise of each gauge is that of the solution
         noises = evaluation.noises.with_sigmas(groups, sigma * problem.noise_ratio)
         evaluation = replace(evaluation, noises=noises)
