@@ -507,11 +507,8 @@ def _missing_condition(session: Session, condition: Condition, missing: Sequence
     lines = [r.line for r in missing if (r.file or session.readings_path) == first]
     numbers = sorted({line for line in lines if line is not None})
     where = f" in {spans(numbers, 'line')}" if numbers else ""
-    column = COLUMNS_OF_CONDITIONS.get(condition)
-    if column is None:
-        return f"{condition} is missing{where}"
     empty = "missing or empty" if len(missing) == len(session.readings) else "incomplete"
-    return f"the column `{column}` is {empty}{where}"
+    return f"the column `{COLUMNS_OF_CONDITIONS[condition]}` is {empty}{where}"
 
 
 def readings_without(session: Session, condition: Condition) -> list[Reading]:
@@ -519,7 +516,7 @@ def readings_without(session: Session, condition: Condition) -> list[Reading]:
 
     A setup without any time needs none: its rows are in the order of time.
     """
-    if condition in ("adjustment", "coordinates"):  # the session states it
+    if condition not in COLUMNS_OF_CONDITIONS:  # the session states it, or it is computed
         return []
     if condition == "approach":
         return [r for r in session.readings if r.approach is None or "u" in r.approach]

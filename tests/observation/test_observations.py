@@ -14,7 +14,7 @@ from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 from orthocal import load_plan, load_session
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
-from orthocal.observation.observations import build_observations
+from orthocal.observation.observations import build_observations, readings_without
 from orthocal.sensors.leg_indicator import Section
 from orthocal.session.session import Reading
 
@@ -152,6 +152,12 @@ def test_values_of_many_groups_of_differences_take_little_time(raw_cycles):
     values = o.values(session.values)
     assert time.process_time() - began < 5.0
     assert np.abs(o.rows(values) - session.values).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("condition", ["load", "adjustment", "coordinates", "reference"])
+def test_conditions_without_a_column_are_never_missing(raw_cycles, condition):
+    """They are computed. An effect with such a condition and a parameter can be identified."""
+    assert readings_without(raw_cycles, condition) == []
 
 
 def test_contacts_move_along_the_leg_with_the_posture(raw_cycles):
