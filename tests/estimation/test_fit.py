@@ -204,6 +204,21 @@ def test_readings_are_weighted_by_the_scatter_of_their_gauge(root):
     assert np.abs(unweighted.theta - known.solution.theta).max() > 1e-6
 
 
+def test_the_rounding_of_one_gauge_is_not_the_noise_of_another(raw_cycles):
+    """Few readings of a gauge that states nothing, and of a dial that is read to 0.1 mm."""
+    setups = {
+        name: replace(s, gauge="coarse" if i % 2 else "silent")
+        for i, (name, s) in enumerate(raw_cycles.setups.items())
+    }
+    rows = tuple(r for r in raw_cycles.readings if r.cycle == 1)
+    gauges = {"silent": Gauge(), "coarse": Gauge(resolution=1e-4)}
+    session = replace(raw_cycles, setups=setups, gauges=gauges, readings=rows)
+    options = SolverOptions(solver="variable-projection")
+    silent, _ = fit_problem(build_problem(session, model="full"), options=options).noises.gauges
+    assert silent.source != "gauge"
+    assert silent.dof < np.inf
+
+
 def test_correlations_are_those_of_the_covariance(session):
     result = identified(session)
     covariance = result.model_covariance
