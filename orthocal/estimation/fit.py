@@ -376,13 +376,11 @@ def _solve_first(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evaluation:
-    """Predictions, residuals and noise of a solution; quantities are those of `Fit`."""
+    """Predictions and noise of a solution; quantities are those of `Fit`."""
 
     prediction: Array
     jacobian: Array
     information: Information
-    residual: Array
-    at_bound: Mask
     noises: NoiseEstimate
 
 
@@ -393,15 +391,14 @@ def _evaluate(
     groups: Sequence[GaugeReadings],
     initial: Array,
 ) -> _Evaluation:
-    """Predictions, Jacobian, residuals and noise at a solution."""
+    """Predictions, Jacobian and noise at a solution."""
     problem = program.problem
     at_bound = problem.selection.held_at_bound(solution.at_bound)
     prediction, jacobian = problem.predict_and_jacobian(solution.theta, solution.passive)
     information = decompose(jacobian, problem.observations)
     residual = _residual(program, solution, prediction)
     scatter = _scatter(program, (jacobian, information), residual, sigma, groups, at_bound)
-    noises = scatter.estimate(initial)
-    return _Evaluation(prediction, jacobian, information, residual, at_bound, noises)
+    return _Evaluation(prediction, jacobian, information, scatter.estimate(initial))
 
 
 def floored_sigma(noise: Noise) -> float:
@@ -454,9 +451,10 @@ def _linearised_sigma(
         Sigma of the first solution, and sigma from the linearised residuals. They differ only if
         the initial sigma is used because of few degrees of freedom.
     """
-    problem = program.problem
+    problem, linear = program.problem, (linearisation.jacobian, linearisation.information)
     sigma = initial = first_sigma(problem, groups)
-    small_dof = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
+    at_active = _scatter(program, linear, linearisation.residual, sigma, groups).common()
+    small_dof = at_active.residual_dof < SMALL_DOF
     use_initial = all(g.gauge.sigma is not None for g in groups) and small_dof
     for i in range(MAX_SIGMA_ROUNDS if _depends_on_sigma(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.active_theta) / problem.theta_scale
@@ -464,26 +462,11 @@ def _linearised_sigma(
         if i == 0:
             rejected = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
             use_initial = use_initial and not rejected
-        linear = linearisation.jacobian, linearisation.information
         estimated = floored_sigma(_scatter(program, linear, residual, sigma, groups).common())
         if not math.isfinite(estimated) or _agrees(estimated / sigma):
             break
         sigma = estimated
     return (initial, sigma) if use_initial else (sigma, sigma)
-
-
-def _residual_dof(
-    problem: CalibrationProblem,
-    information: Information,
-    sigma: float,
-    at_bound: Mask | None = None,
-) -> float:
-    """Number of readings minus free zeros and effective parameters."""
-    o, precision = problem.observations, problem.prior_precision
-    used = information.posterior(
-        sigma=sigma, precision=precision, at_bound=at_bound
-    ).effective_parameters
-    return o.size - o.n_free_zeros - used
 
 
 def require_determined(problem: CalibrationProblem, information: Information) -> None:
