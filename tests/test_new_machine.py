@@ -554,6 +554,11 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path, mon
     session = load_plan(tmp_path / "delta/first")
     assert {s.sensor.kind for s in session.setups.values()} == {"tool_indicator"}
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
+    file = tmp_path / "delta/machine.yaml"
+    text = file.read_text().replace("travel_mm: [30,", "travel_mm: [180,")
+    file.write_text(text.replace("[[-70, 70], [-70, 70], [0, 140]]", "[[-9, 9], [-9, 9], [0, 9]]"))
+    code, _, err = orthocal("new", tmp_path / "delta", "--again")
+    assert (code, "orthocal new" in err, "orthocal plan" in err) == (3, True, False)
 
 
 @pytest.mark.usefixtures("unsheeted")

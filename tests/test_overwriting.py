@@ -44,6 +44,7 @@ RESULTS = {
     ("export", "one", "--to", "linuxcnc", "--module", "--within", "10", "--out", "out"): [
         *("kinematics.ini", "orthocal_core.c"),
     ],
+    ("study", "sensitivity", "session", "--out", "out"): ["study.json", "study.svg"],
     ("correct", "one", "program.ngc", "--out", "out/part.ngc"): ["part.ngc"],
 }
 """A command and the names of results that it writes."""

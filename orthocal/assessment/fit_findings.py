@@ -277,8 +277,8 @@ def find_line_model_error(session: Session, sigmas: Mapping[str, float]) -> Line
         ratios = np.nan_to_num(sizes / np.maximum(sigma, SMALLEST_SIGMA))
         worst = int(ratios.argmax())
         setup = readings[worst].setup
-        found = LineModelError(setup, rods[setup], float(sizes[worst]))
-        candidates.append((float(ratios[worst]), found))
+        error = LineModelError(setup, rods[setup], float(sizes[worst]))
+        candidates.append((float(ratios[worst]), error))
     return max(candidates, key=lambda c: c[0])[1]
 
 

@@ -139,8 +139,8 @@ def _coarser_step(values: Array, step: float) -> float:
     nonzero = np.abs(values[values != 0.0]) / step
     while 10.0 ** -len(nonzero) < MISTAKE_PROBABILITY:
         coarser = nonzero / 10.0
-        whole = np.round(coarser)
-        if (whole == 0.0).any() or (np.abs(coarser - whole) > STEP_TOLERANCE).any():
+        integers = np.round(coarser)
+        if (integers == 0.0).any() or (np.abs(coarser - integers) > STEP_TOLERANCE).any():
             break
         nonzero, step = coarser, 10.0 * step
     return step
@@ -161,7 +161,7 @@ def find_finer(session: Session) -> Iterator[Finding]:
             finest = _finer_rows(session, rows, replace(gauge, resolution=step / 10.0))
             by_setup = group_rows(session.readings[i].setup for i in rows)
             rows_of = {setup: {rows[k] for k in places} for setup, places in by_setup.items()}
-            complete = [s for s, own in rows_of.items() if own <= set(finer) and own & set(finest)]
+            complete = [s for s, r in rows_of.items() if r <= set(finer) and r & set(finest)]
             yield words.finer_than_gauge(
                 len(finer),
                 len(rows),
@@ -264,8 +264,8 @@ def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None
     worst = int(np.argmax(np.abs(deviations)))
     others = [r for i, r in enumerate(session.readings) if i != worst]
     if np.abs(deviations[worst]) > DOMINANT_SHARE * np.linalg.norm(deviations) and others:
-        rest = session.select(others)
-        return _dimensions(rest, build_problem(rest, model="offsets"))
+        without_worst = session.select(others)
+        return _dimensions(without_worst, build_problem(without_worst, model="offsets"))
     return words.wrong_dimensions(describe_legs(session.robot), _rms(predictions), measured)
 
 

@@ -132,22 +132,22 @@ def _predict_noise(calibration: Calibration, fit: Fit) -> _PredictedNoise:
     """
     sigma, inverse_dof = np.empty(fit.problem.observations.size), 0.0
     by_residuals = True
-    for group, own in zip(fit.groups, fit.noises.gauges, strict=True):
+    for group, noise in zip(fit.groups, fit.noises.gauges, strict=True):
         stated = group.gauge.sigma, group.gauge.resolution
         known = [k for k in calibration.gauges if (k.sigma, k.resolution) == stated]
         if known:
-            found = [_of_calibration(calibration, k) for k in known]
-            variance = sum(s**2 for s, _ in found) / len(found)
-            dof = sum(dof for _, dof in set(found))
+            noises = [_of_calibration(calibration, k) for k in known]
+            variance = sum(s**2 for s, _ in noises) / len(noises)
+            dof = sum(dof for _, dof in set(noises))
             by_residuals &= not calibration.prior or all(
                 k.noise.source == "residuals" for k in known
             )
         else:
             by_residuals, separate, dof = False, noise_floor(*stated), math.inf
-            if own.cycles_dof >= FEW_DOF:
-                separate, dof = own.without_residuals(*stated)
+            if noise.cycles_dof >= FEW_DOF:
+                separate, dof = noise.without_residuals(*stated)
             if not separate > 0.0:
-                separate, dof = own.sigma, own.dof
+                separate, dof = noise.sigma, noise.dof
             variance = separate**2
             for k in calibration.gauges:
                 if k.noise.source == "residuals":  # with unmodelled errors

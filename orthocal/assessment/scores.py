@@ -190,8 +190,8 @@ def _chi_square(fit: Fit, errors: Array, noises: Mapping[str, Noise]) -> float:
     total = 0.0
     for group in fit.groups:
         sigma = noises[group.name].sigma
-        own = errors[group.entries]
-        total += float(own @ own) / sigma**2 if sigma > 0.0 else math.nan
+        of_group = errors[group.entries]
+        total += float(of_group @ of_group) / sigma**2 if sigma > 0.0 else math.nan
     return total
 
 

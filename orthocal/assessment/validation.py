@@ -359,8 +359,9 @@ def _explain_deviations(judgement: Judgement, before: Session, new: Session) -> 
     """
     if not judgement.anomalies:
         return bool(find_scattered(new)) and not find_scattered(before)
-    found = [e for a in judgement.anomalies for e in (a.explanation, *a.causes, *a.alternatives)]
-    return all(e.rows and min(e.rows) >= len(before.readings) for e in found)
+    anomalies = judgement.anomalies
+    explanations = [e for a in anomalies for e in (a.explanation, *a.causes, *a.alternatives)]
+    return all(e.rows and min(e.rows) >= len(before.readings) for e in explanations)
 
 
 def _calibrate_jointly(

@@ -551,10 +551,7 @@ def _make_again(folder: Path) -> None:
         changes = _remake_sheet(sheet, robot) if exists(sheet.parent / "session.yaml") else []
         if changes:
             is_outdated = True
-            advice = (
-                "plan again:\n  orthocal plan "
-                f"{quote_path(folder)} --out {quote_path(sheet.parent)} --force"
-            )
+            advice = _advise_plan(folder, sheet.parent)
             if _count_readings(sheet.parent):
                 advice = (
                     "it has readings, so check the dimensions: with longer legs, for instance, "
@@ -563,6 +560,20 @@ def _make_again(folder: Path) -> None:
             put_note(f"orthocal: {sheet.parent}: the plan is old ({'; '.join(changes)}); {advice}")
     if is_outdated:
         raise typer.Exit(3)
+
+
+def _advise_plan(folder: Path, session: Path) -> str:
+    """Command that replaces an outdated plan of a machine."""
+    from orthocal.builder.machine_file import MACHINE, read_machine
+
+    reads_legs = read_machine(folder / MACHINE)[0].read_legs
+    if reads_legs or exists(session / "plan.json"):
+        out = f"--out {quote_path(session)} --force"
+        return f"plan again:\n  orthocal plan {quote_path(folder)} {out}"
+    return (
+        "make the machine with its plan again, by the options with which you made it:\n  "
+        f"orthocal new {quote_path(folder)} --force …"
+    )
 
 
 def _count_readings(folder: Path) -> int:

@@ -35,8 +35,8 @@ COMMENTS = {
 }
 """Forms of a comment by the suffix of a file."""
 
-TABLES = (".csv", ".comp")
-"""Suffixes of files without comments, which cannot contain a mark."""
+UNMARKED = (".csv", ".comp", ".parquet", ".svg")
+"""Suffixes of tables and plots, which contain no mark."""
 
 _MARKS = re.compile(
     rb"Written by orthocal|Corrected by orthocal|\(orthocal: |"
@@ -166,8 +166,8 @@ def count_numbers(path: Path) -> int:
 def require_replaceable_results(directory: Path, files: Mapping[str, str], *, force: bool) -> None:
     """Refuse to overwrite files that orthocal did not write.
 
-    A table has no mark. It counts as written by orthocal if a file beside it has a mark, or if it
-    has the header of the new table.
+    A table or a plot has no mark. It counts as written by orthocal if a file beside it has a mark,
+    or if it has the header of the new table.
 
     Args:
         directory: The directory; it need not exist.
@@ -182,8 +182,8 @@ def require_replaceable_results(directory: Path, files: Mapping[str, str], *, fo
     existing = {directory / n: text for n, text in files.items() if exists(directory / n)}
     marked = {path for path in existing if _is_marked(path)}
     for path, text in existing.items():
-        is_table = path.suffix in TABLES and (marked or _has_header(path, text))
-        if not (force or path in marked or is_table):
+        unmarked = path.suffix in UNMARKED and (marked or _has_header(path, text))
+        if not (force or path in marked or unmarked):
             raise _refusal(path)
 
 

@@ -143,10 +143,10 @@ class Dialogue:
         present = self._conditions.of(row)
         if not row.is_read:
             return present
-        kept = {"approach"}
+        repeated = {"approach"}
         if self._keeps_conditions(index):
-            kept |= {"temperature", "time"}
-        return replace(present, **dict.fromkeys(kept - self._stated))
+            repeated |= {"temperature", "time"}
+        return replace(present, **dict.fromkeys(repeated - self._stated))
 
     def _show_again(self) -> None:
         self._shown = None

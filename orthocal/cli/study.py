@@ -42,6 +42,7 @@ from orthocal.cli.options import (
     split_effects,
     split_globs,
 )
+from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import deliver, put_note
 from orthocal.errors import ParameterError
 from orthocal.io.files import Content, require_writable
@@ -171,7 +172,7 @@ def linearisation(
     free: list[str] | None = None,
     largest_mm: float = 50.0,
     sizes: Size = 40,
-    directions: Size = 25,
+    directions: Annotated[int | None, Option(min=1, max=10_000)] = None,
     along: str | None = None,
     max_mm: float | None = None,
     min_mm: float | None = None,
@@ -191,7 +192,7 @@ def linearisation(
         free (GLOBS): Errors that grow; default: offsets.
         largest_mm (SIZE): Largest size of the errors, mm or mrad.
         sizes (N): Number of sizes, from 0.1 mm on.
-        directions (N): Number of random directions of the errors.
+        directions (N): Number of random directions of the errors; default: 25.
         along (A,B,...): One direction in place of random ones, such as 1,-0.6,0.3.
         max_mm (MM): Displacement of the paper's maximum postures; default: 60 mm, scaled with legs.
         min_mm (MM): Displacement of the minimum postures; default: -100 mm, scaled with legs.
@@ -201,6 +202,8 @@ def linearisation(
     from orthocal.planning.first_plan import PAPER_GAUGE
 
     require_between(largest_mm, 0.0, LARGEST_MM, "--largest-mm")
+    if along is not None and directions is not None:
+        raise ParameterError("cannot be combined with --along", where="--directions")
     displacements = _read_displacements(leg_mm, max_mm, min_mm)
     for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
         if value is not None:
@@ -215,7 +218,7 @@ def linearisation(
             free=split_globs(free) or ("*.offset",),
             largest=largest_mm,
             count=sizes,
-            directions=directions,
+            directions=directions or 25,
             along=None if along is None else read_numbers(along, "--along"),
             displacements=displacements,
             gauge=orthocal.Gauge(
@@ -327,7 +330,8 @@ def _run(study: orthocal.Study, options: RunOptions) -> None:
             where="--workers",
         )
     if out is not None:
-        require_writable(out, [JOURNAL, *FILES])
+        require_writable(out, [JOURNAL])
+        require_replaceable_results(out, dict.fromkeys(FILES, ""), force=options.force)
     count = options.workers or available_cores()
     resume = "with --out it can be resumed" if out is None else "the same command resumes it"
     with message_at_interrupt(f"orthocal: stopped; {resume}"):

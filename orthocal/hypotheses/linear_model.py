@@ -523,14 +523,14 @@ class LinearModel:
             return about.likelihood.misfit(deviation - amount * effect)
 
         best = self._descend(self.at_reference(keep_jacobian=False), entries, effect)
-        found = [best]
+        minima = [best]
         for theta in self._mirrored(best):
             try:
                 start = self.linearise(theta, (), best.passive, keep_jacobian=False)
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 continue
-            found.append(self._descend(start, entries, effect))
-        return min(found, key=misfit)
+            minima.append(self._descend(start, entries, effect))
+        return min(minima, key=misfit)
 
     def _mirrored(self, about: ModelLinearisation) -> Array:
         """Starts on the other sides of directions of second order, (n_starts, n_free)."""

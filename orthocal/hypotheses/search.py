@@ -309,8 +309,10 @@ class _Search:
         """
         while len(state.terms) > 1:
             near = self.sets.evaluate_all(_reduced(state), self.sound.about)
-            own = [self.sets.most_likely(s.terms) or s for s in near]
-            without = [min(p, key=negative_log_posterior) for p in zip(near, own, strict=True)]
+            reoptimised = [self.sets.most_likely(s.terms) or s for s in near]
+            without = [
+                min(p, key=negative_log_posterior) for p in zip(near, reoptimised, strict=True)
+            ]
             superfluous = [
                 s
                 for t, s in zip(state.terms, without, strict=True)

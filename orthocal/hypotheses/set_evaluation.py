@@ -126,15 +126,15 @@ class SetEvaluator:
         """
         if not shifts:
             return []
-        found: list[ModelLinearisation | None] = [None] * len(shifts)
+        results: list[ModelLinearisation | None] = [None] * len(shifts)
         for about in (self.sound.about, self.reference):
-            missing = [i for i, one in enumerate(found) if one is None]
+            missing = [i for i, one in enumerate(results) if one is None]
             points = [LinearisationPoint(about.theta, shifts[i], about.passive) for i in missing]
             for i, one in zip(
                 missing, self.model.linearise_all(points, keep_jacobian=True), strict=True
             ):
-                found[i] = one
-        return found
+                results[i] = one
+        return results
 
     def _next_point(self, state: HypothesisSet, *, first: bool) -> LinearisationPoint | None:
         """Errors that a set implies, to linearise about; None if they are too near or too far."""

@@ -324,20 +324,20 @@ class ToolForecast:
         if possible.sum() <= o.n_free_zeros:
             return None, lost
         o, noise = o.only(possible), stated_sigma(problem.session.gauge)
-        excess = np.ones((o.size, 1))  # weighting standard deviations, divided by those of noise
+        inflation = np.ones((o.size, 1))  # of the standard deviations for weighting
         if weights is not None:
-            excess = (weights / (noise * problem.noise_ratio))[possible, None]
+            inflation = (weights / (noise * problem.noise_ratio))[possible, None]
         precision = np.maximum(problem.prior_precision, VAGUE)
-        jacobian = project_out_zeros(jacobian[possible], o) / excess
+        jacobian = project_out_zeros(jacobian[possible], o) / inflation
         inverse = Information(jacobian).posterior(sigma=noise, precision=precision).covariance
         scale = problem.theta_scale[:n]
         # the scatter of the readings is smaller than their weights imply
         gain = inverse @ jacobian.T / noise
-        covariance = inverse - gain * (1.0 - excess.T**-2) @ gain.T
+        covariance = inverse - gain * (1.0 - inflation.T**-2) @ gain.T
         identified = covariance[:n, :n] * np.outer(scale, scale)
         if others is None:
             return identified, lost
-        others = project_out_zeros(others[possible], o) / excess
+        others = project_out_zeros(others[possible], o) / inflation
         bias = (inverse @ (jacobian.T @ others) / noise**2)[:n] * scale[:, None]
         variance = np.diag(self.prior_stds[n:] ** 2)
         cross = bias * self.prior_stds[n:]

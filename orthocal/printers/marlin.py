@@ -233,14 +233,14 @@ def _table(source: LogText, radius: float | None) -> _Probing | None:
     printed = list(_G33.finditer(text))
     ends = [*(m.start() for m in printed[1:]), len(text)]
     tables = [
-        (m, found)
+        (m, rows)
         for m, end in zip(printed, ends, strict=False)
-        if len(found := list(_TABLE_POINT.finditer(text, m.end(), end))) >= MIN_POINTS
+        if len(rows := list(_TABLE_POINT.finditer(text, m.end(), end))) >= MIN_POINTS
     ]
     if not tables:
         return None
     runs = [m.start() for m in _G33_RUN.finditer(text) if m.start() < tables[-1][0].start()]
-    g33, found = next(t for t in tables if t[0].start() >= (runs or [0])[-1])
+    g33, rows = next(t for t in tables if t[0].start() >= (runs or [0])[-1])
     commands = [m for m in _G33_COMMAND.finditer(text) if m.start() < g33.start()]
     if commands and (averaged := _AVERAGED.search(commands[-1][0])):
         raise SessionError(
@@ -249,7 +249,7 @@ def _table(source: LogText, radius: float | None) -> _Probing | None:
         )
     distance = _require_radius(text, radius, "G33")
     points = []
-    for match in found:
+    for match in rows:
         line = source.place(match.start())
         (height,) = numbers([match[2]], where=line, name=match[1])
         angle = POINT_DIRECTIONS[match[1]]

@@ -102,10 +102,12 @@ class Distance(ToolSensor):
     @property
     def mounting_steps(self) -> tuple[str, ...]:
         """Instructions for the operator."""
+        enter = "Enter the value that it shows, the width of the pillar included."
+        if not self.width:
+            enter = "Subtract the width of a pillar that the value includes, then enter it."
         return (
             "Print or mark the object at the positions of both postures, and let it cool down.",
-            "Measure the distance between both marks with a calliper. Enter the value that it "
-            "shows, the width of the pillar included.",
+            f"Measure the distance between both marks with a calliper. {enter}",
         )
 
     def frames(self, robot: Robot) -> Frames:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from numbers import Integral, Real
-from typing import NoReturn, get_args
+from typing import get_args
 
 import numpy as np
 
 from orthocal.effects.adjustment import require_adjustment
 from orthocal.errors import SessionError
+from orthocal.io.documents import MOST_SHOWN
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.sensors.protocol import GaugeZero
 from orthocal.session.differences import IndependentReadings
@@ -24,9 +25,6 @@ from orthocal.session.session import (
     Setup,
 )
 from orthocal.text import list_some
-
-MOST_NAMED = 8
-"""Largest number of names in a message."""
 
 
 def require_complete(session: Session) -> None:
@@ -98,10 +96,9 @@ def _require_setup(session: Session, setup: Setup) -> None:
     if not hasattr(setup.sensor, "require_fit"):
         raise SessionError(f"found {setup.sensor!r}; expected a sensor", where=f"{where}.sensor")
     setup.sensor.require_fit(session.robot, where=where)
-    if setup.gauge not in session.gauges:
-        _refuse_name(setup.gauge, "gauge", session.gauges, where=where)
-    if setup.aligned_at is not None and setup.aligned_at not in session.postures:
-        _refuse_name(setup.aligned_at, "posture", session.postures, where=f"{where}.aligned_at")
+    require_name(setup.gauge, session.gauges, "gauge", where=where)
+    if setup.aligned_at is not None:
+        require_name(setup.aligned_at, session.postures, "posture", where=f"{where}.aligned_at")
     if setup.zero not in get_args(GaugeZero):
         expected = " or ".join(get_args(GaugeZero))
         raise SessionError(f"found {setup.zero!r}; expected {expected}", where=f"{where}.zero")
@@ -127,11 +124,9 @@ def _require_readings(session: Session) -> None:
     zoned: dict[str, bool] = {}
     for r in session.readings:
         _require_kind(r, Reading, "readings")
-        if r.setup not in session.setups:
-            _refuse_name(r.setup, "setup", session.setups, where="readings")
+        require_name(r.setup, session.setups, "setup", where="readings")
         for posture in (r.posture, *([] if r.minus is None else [r.minus])):
-            if posture not in session.postures:
-                _refuse_name(posture, "posture", session.postures, where="readings")
+            require_name(posture, session.postures, "posture", where="readings")
         if not isinstance(r.value, Real) or math.isinf(r.value):
             raise SessionError(
                 f"found {r.value!r}; expected a finite number, in m", where=session.where(r)
@@ -191,7 +186,12 @@ def _require_conditions(
             )
 
 
-def _refuse_name(name: str, noun: str, known: Mapping[str, object], *, where: str) -> NoReturn:
-    """Refuse an unknown name of a setup, a posture or a gauge."""
-    listed = list_some(list(known), MOST_NAMED)
-    raise SessionError(f"'{name}' is not a {noun}; {noun}s: {listed}", where=where)
+def require_name(name: str, known: Collection[str], noun: str, *, where: str) -> None:
+    """Refuse an unknown name of a setup, a posture or a gauge.
+
+    Raises:
+        SessionError: If the name is unknown; lists the known ones.
+    """
+    if name not in known:
+        listed = list_some(list(known), MOST_SHOWN)
+        raise SessionError(f"'{name}' is not a {noun}; {noun}s: {listed}", where=where)

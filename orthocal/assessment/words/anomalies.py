@@ -607,10 +607,10 @@ def _other_offset(session: Session, e: Explanation) -> str:
     setup = list(session.setups)[session.labels.index(e.sessions[0])]
     stated = float(session.active_during(setup)[drive])
     uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
-    found = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
+    actual = f"{signed((stated - e.amount) * p.edge_factor)}{uncertainty} {p.edge_unit}"
     return (
         f"its offset in the controller is not {signed(stated * p.edge_factor)} {p.edge_unit} as "
-        f"stated, but {found}"
+        f"stated, but {actual}"
     )
 
 

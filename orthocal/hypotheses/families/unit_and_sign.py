@@ -170,7 +170,7 @@ def decimal_steps(values: Array) -> Array:
     result = np.zeros(len(values))
     for decimals in reversed(range(MAX_DECIMALS)):
         step = 10.0**-decimals * MM
-        whole = np.round(values / step)
-        divides = np.abs(values / step - whole) < STEP_TOLERANCE
-        result[divides & ((whole != 0.0) | (values == 0.0))] = step
+        integers = np.round(values / step)
+        divides = np.abs(values / step - integers) < STEP_TOLERANCE
+        result[divides & ((integers != 0.0) | (values == 0.0))] = step
     return result

@@ -300,7 +300,9 @@ def _read_headings(
 ) -> list[Heading | None]:
     """Meaning of every heading of a row; roles assigned by the user replace those of headings."""
     indices = {key: _find_column(texts, name) for key, name in assigned.items()}
-    by_index = {found[0]: parse_role(key) for key, found in indices.items() if len(found) == 1}
+    by_index = {
+        columns[0]: parse_role(key) for key, columns in indices.items() if len(columns) == 1
+    }
     assigned_roles = {parse_role(key).role for key in assigned}
     headings: list[Heading | None] = []
     for index, text in enumerate(texts):

@@ -99,6 +99,7 @@ def report_study(table: StudyTable, *, all_rows: bool = False) -> StudyReport:
 def study_json(table: StudyTable, report: StudyReport) -> str:
     """A study and its summary as JSON; names of keys end with the unit."""
     document = {
+        "schema": "orthocal/study/1",
         "study": table.study.document,
         "digest": table.study.digest,
         "rows": len(table),
