@@ -561,3 +561,15 @@ def errors_at(where: str) -> Iterator[None]:
         yield
     except ParameterError as e:
         raise ParameterError(e.problem, where=e.where or where) from None
+
+
+def split_assignment(text: str, form: str, where: str) -> tuple[str, str]:
+    """Key and value of an option such as KEY=VALUE, which may have blanks.
+
+    Raises:
+        ParameterError: If there is no '='.
+    """
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ParameterError(f"found '{text}'; expected {form}", where=where)
+    return composed(key.strip()), value.strip()

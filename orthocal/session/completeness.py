@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from numbers import Real
+from numbers import Integral, Real
 from typing import get_args
 
 import numpy as np
@@ -15,7 +15,15 @@ from orthocal.io.documents import MOST_SHOWN
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.sensors.protocol import GaugeZero
 from orthocal.session.differences import IndependentReadings
-from orthocal.session.session import Gauge, Posture, Reading, ReadingKey, Session, Setup
+from orthocal.session.session import (
+    Conditions,
+    Gauge,
+    Posture,
+    Reading,
+    ReadingKey,
+    Session,
+    Setup,
+)
 from orthocal.text import list_some
 
 
@@ -30,7 +38,10 @@ def require_complete(session: Session) -> None:
     _require_named(session.setups, Setup, "setups")
     for name, gauge in session.gauges.items():
         _require_kind(gauge, Gauge, f"gauges.{name}")
-    _require_offsets(session, session.controller_offsets, "controller_offsets")
+    for name, posture in session.postures.items():
+        _require_drives(session, posture.drives, f"postures.{name}.drives")
+    if session.controller_offsets is not None:
+        _require_drives(session, session.controller_offsets, "controller_offsets")
     _require_adjustments(session, session.adjusted, "adjusted")
     for setup in session.setups.values():
         _require_setup(session, setup)
@@ -59,16 +70,15 @@ def _require_kind(value: object, kind: type, where: str) -> None:
         raise SessionError(f"found a {found}; expected a {expected}", where=where)
 
 
-def _require_offsets(session: Session, offsets: object, where: str) -> None:
-    """Refuse active offsets that are not one number for each drive; None if not stated."""
+def _require_drives(session: Session, values: object, where: str) -> None:
+    """Refuse drive coordinates or offsets that are not one number for each drive."""
     count = len(session.robot.drives)
-    if offsets is None or (
-        isinstance(offsets, np.ndarray) and offsets.shape == (count,) and np.isfinite(offsets).all()
+    if not (
+        isinstance(values, np.ndarray) and values.shape == (count,) and np.isfinite(values).all()
     ):
-        return
-    raise SessionError(
-        f"found {offsets!r}; expected an array of {count} numbers, in m or rad", where=where
-    )
+        raise SessionError(
+            f"found {values!r}; expected an array of {count} numbers, in m or rad", where=where
+        )
 
 
 def _require_adjustments(session: Session, adjusted: Mapping[str, float], where: str) -> None:
@@ -97,7 +107,8 @@ def _require_setup(session: Session, setup: Setup) -> None:
             f"found {setup.payload}; expected 0 or a positive number, in kg",
             where=f"{where}.payload",
         )
-    _require_offsets(session, setup.active, f"{where}.active")
+    if setup.active is not None:
+        _require_drives(session, setup.active, f"{where}.active")
     _require_adjustments(session, setup.adjusted or {}, f"{where}.adjusted")
 
 
@@ -110,6 +121,7 @@ def _require_readings(session: Session) -> None:
     if not session.readings:
         raise SessionError("there are none; expected at least one", where="readings")
     keys, independent = set[ReadingKey](), IndependentReadings()
+    zoned: dict[str, bool] = {}
     for r in session.readings:
         _require_kind(r, Reading, "readings")
         require_name(r.setup, session.setups, "setup", where="readings")
@@ -119,13 +131,13 @@ def _require_readings(session: Session) -> None:
             raise SessionError(
                 f"found {r.value!r}; expected a finite number, in m", where=session.where(r)
             )
-        if r.cycle < 1:
+        if not isinstance(r.cycle, Integral) or r.cycle < 1:
             raise SessionError(
-                f"found the cycle {r.cycle}; expected at least 1", where=session.where(r)
+                f"found the cycle {r.cycle!r}; expected a whole number from 1",
+                where=session.where(r),
             )
-        approach = None if r.conditions is None else r.conditions.approach
-        if approach is not None and (problem := find_approach_problem(approach, session.robot)):
-            raise SessionError(f"approach: found {problem}", where=session.where(r))
+        if r.conditions is not None:
+            _require_conditions(session, r, r.conditions, zoned)
         if r.key in keys:
             raise SessionError(
                 f"repeats cycle {r.cycle}; count the repetitions: cycle 1, 2, …",
@@ -141,6 +153,37 @@ def _require_readings(session: Session) -> None:
             f"{missing} of {count} readings have no value; expected readings, in m",
             where="readings",
         )
+
+
+def _require_conditions(
+    session: Session, reading: Reading, conditions: Conditions, zoned: dict[str, bool]
+) -> None:
+    """Refuse conditions that do not fit the session.
+
+    Args:
+        session: The session.
+        reading: The reading with the conditions.
+        conditions: Its conditions.
+        zoned: Setups, mapped to whether their times have a time zone. A first time is added.
+    """
+    where = session.where(reading)
+    _require_kind(conditions, Conditions, where)
+    approach, time = conditions.approach, conditions.time
+    if approach is not None and (problem := find_approach_problem(approach, session.robot)):
+        raise SessionError(f"approach: found {problem}", where=where)
+    if not math.isfinite(conditions.temperature or 0.0):
+        raise SessionError(
+            f"temperature: found {conditions.temperature}; expected a finite number, in °C",
+            where=where,
+        )
+    if time is not None:
+        has_zone = time.tzinfo is not None
+        if zoned.setdefault(reading.setup, has_zone) != has_zone:
+            raise SessionError(
+                f"time: found {time}; expected all times of setup '{reading.setup}' with a time "
+                "zone, or all without one",
+                where=where,
+            )
 
 
 def require_name(name: str, known: Collection[str], noun: str, *, where: str) -> None:
