@@ -21,6 +21,7 @@ from pydantic import Field
 from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
 from orthocal.sensors.direction import direction_vector
+from orthocal.sensors.mounting import Millimetres, Milliradians
 from orthocal.sensors.protocol import (
     PROBING_DISTANCE,
     GaugeZero,
@@ -35,8 +36,6 @@ from orthocal.sensors.tool_indicator import (
     LENGTH_MM,
     Artefact,
     Length,
-    Millimetres,
-    Milliradians,
     Point,
     ToolIndicator,
 )
@@ -72,7 +71,6 @@ class ProbeKeys(SetupKeys):
 class Probe(ToolIndicator):
     """Probe at the tool that triggers at a surface."""
 
-    scale_std: float = 0.0
     trigger_std: float = TRIGGER_STD
     """Prior standard deviation of the trigger height, [m]."""
 
@@ -141,9 +139,8 @@ class Probe(ToolIndicator):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and form of the surface, and the trigger height."""
-        surface = self._artefact_parameters()
         trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
-        return (*surface, *trigger)
+        return (*self.artefact.nuisance_parameters, *trigger)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Height of the surface, [m]."""

@@ -12,7 +12,8 @@ reach it, it is not below a bed, the tip stays on the rod, and the dial stays in
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -20,7 +21,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, SessionError, UnreachablePathError
+from orthocal.errors import ClosureError, OrthocalError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
@@ -175,19 +176,11 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    first = {setup: rows[0][1] for setup, rows in rows_by_setup.items()}
     guided, probed = _guided_setups(session), _probed_setups(session)
-    by_rule = {setup for setup in first if setup not in guided and setup not in probed}
-    additional_alignments = {
-        aligned_at[s]
-        for s, r in first.items()
-        if s in by_rule and aligned_at[s] != (r.minus or r.posture)
-    }
-    readings = [r for r in session.readings if r.setup in by_rule]
-    stop_at = _find_approaches(session, readings, additional_alignments) if readings else {}
+    stop_at = _find_approaches(session, _unguided_places(session, {*guided, *probed}))
     motions = []
     for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
-        if setup not in by_rule:
+        if setup in guided or setup in probed:
             on_path = _stops_on_path(session, setup)
             listed = _list_stops(rows, aligned_at[setup], on_path, any_side=True)
             if setup in guided:
@@ -201,6 +194,46 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows_by_setup), alignment, tuple(stops)))
     return tuple(motions)
+
+
+def common_approach(session: Session) -> str | None:
+    """Approach of programs in postures without a stated one; None if no common one is possible.
+
+    It is also None if no effect of the machine depends on the approach.
+    """
+    places = _unguided_places(session, {*_guided_setups(session), *_probed_setups(session)})
+    if not places or not usual_approaches(session.robot):
+        return None
+    for letter in "pn":
+        if _free_failure(_begin_approaches(session, places, letter)[1]) is None:
+            return letter * len(session.robot.drives)
+    return None
+
+
+def state_program_approaches(session: Session) -> Session:
+    """Session in which readings without a stated approach get that of programs, if possible."""
+    guided = {*_guided_setups(session), *_probed_setups(session)}
+    if any(r.setup in guided and r.approach is None for r in session.readings):
+        with suppress(OrthocalError):  # no program can be made
+            session = state_path_approaches(session)
+    common = common_approach(session)
+    return _with_approaches(session, lambda _, r: r.approach or common)
+
+
+def _with_approaches(session: Session, find: Callable[[int, Reading], str | None]) -> Session:
+    """Session whose readings in one posture have other approaches.
+
+    Args:
+        session: The session.
+        find: Function from the index of a reading and the reading to its approach; None for the
+            stated one.
+    """
+    readings = list(session.readings)
+    for i, r in enumerate(readings):
+        if r.minus is None and (approach := find(i, r)) not in (None, r.approach):
+            conditions = replace(r.conditions or Conditions(), approach=approach)
+            readings[i] = replace(r, conditions=conditions)
+    return replace(session, readings=tuple(readings))
 
 
 def _refuse_pairs(session: Session) -> None:
@@ -228,34 +261,31 @@ def state_path_approaches(session: Session) -> Session:
     Raises:
         SessionError: If there are too many readings, or a posture cannot be reached or approached.
     """
-    guided = _guided_setups(session)
+    guided = {*_guided_setups(session), *_probed_setups(session)}
     if not guided:
         return session
     if not usual_approaches(session.robot):
         if session.robot.bed is not None:
             plan_motion(session.select([r for r in session.readings if r.setup in guided]))
         return session
-    approaches = {
-        (m.setup, stop.line): stop.approach
-        for m in plan_motion(session)
-        if m.setup in guided
-        for stop in m.stops
+    rows = enumerate(session.readings)
+    of_guided = tuple(replace(r, line=i) for i, r in rows if r.setup in guided)
+    approach_by_row = {
+        stop.line: stop.approach
+        for motion in plan_motion(replace(session, readings=of_guided))
+        for stop in motion.stops
         if stop.role == "reading"
     }
-    readings = tuple(
-        replace(r, conditions=replace(r.conditions or Conditions(), approach=approaches[key]))
-        if (key := (r.setup, i + FIRST_LINE if r.line is None else r.line)) in approaches
-        else r
-        for i, r in enumerate(session.readings)
-    )
-    return replace(session, readings=readings)
+    return _with_approaches(session, lambda i, _: approach_by_row.get(i))
 
 
 Path = Callable[[Array, Array], Array]
 """Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
 
-Approaches = dict[tuple[str, str | None], Stop]
-"""Stops by posture and stated approach, which is None if not stated."""
+Place = tuple[str, str | None]
+"""Posture and stated approach, which is None if not stated."""
+
+Approaches = dict[Place, Stop]
 
 
 def _guided_setups(session: Session) -> dict[str, Path]:
@@ -329,9 +359,20 @@ def _stops_on_path(session: Session, setup: str) -> Approaches:
     return stops
 
 
-def _find_approaches(
-    session: Session, readings: Sequence[Reading], alignment: set[str]
-) -> Approaches:
+def _unguided_places(session: Session, guided: Collection[str]) -> list[Place]:
+    """Postures to read or to align a gauge, with stated approaches, of setups without a path."""
+    ordered = (session.readings[i] for i in order_of_measurement(session.readings))
+    unguided = [r for r in ordered if r.setup not in guided]
+    first = {r.setup: r.minus or r.posture for r in reversed(unguided)}
+    aligned_at = session.alignment_postures
+    places: set[Place] = {(aligned_at[s], None) for s, p in first.items() if aligned_at[s] != p}
+    places |= {(r.posture, r.approach) for r in unguided}
+    places |= {(r.minus, None) for r in unguided if r.minus is not None}
+    order = {name: i for i, name in enumerate(session.postures)}
+    return sorted(places, key=lambda place: (order[place[0]], place[1] or ""))
+
+
+def _find_approaches(session: Session, places: Sequence[Place]) -> Approaches:
     """Stops to read or to align a gauge, each at the end of its approach.
 
     Postures without a stated approach are all approached from one side. The same side applies to
@@ -339,22 +380,18 @@ def _find_approaches(
 
     Args:
         session: The session.
-        readings: The readings to approach.
-        alignment: Names of the alignment postures.
+        places: Postures and stated approaches.
 
     Raises:
         SessionError: If neither side is possible in all these postures, or a posture cannot be
             approached as stated.
     """
-    wanted: set[tuple[str, str | None]] = {(name, None) for name in alignment}
-    wanted |= {(r.posture, r.approach) for r in readings}
-    wanted |= {(r.minus, None) for r in readings if r.minus is not None}
-    order = {name: i for i, name in enumerate(session.postures)}
-    places = sorted(wanted, key=lambda place: (order[place[0]], place[1] or ""))
+    if not places:
+        return {}
     refused: list[ClosureError] = []
     for letter in "pn":
         stops, failures = _begin_approaches(session, places, letter)
-        first = next((e for (_, s), e in failures.items() if s is None or "u" in s), None)
+        first = _free_failure(failures)
         if first is not None:
             refused.append(first)
             continue
@@ -372,9 +409,14 @@ def _find_approaches(
     )
 
 
+def _free_failure(failures: Mapping[Place, ClosureError]) -> ClosureError | None:
+    """First error of a place where the side of a drive is not stated; None without one."""
+    return next((e for (_, stated), e in failures.items() if "u" in (stated or "u")), None)
+
+
 def _begin_approaches(
-    session: Session, places: Sequence[tuple[str, str | None]], letter: str
-) -> tuple[Approaches, dict[tuple[str, str | None], ClosureError]]:
+    session: Session, places: Sequence[Place], letter: str
+) -> tuple[Approaches, dict[Place, ClosureError]]:
     """Stops of postures with their approaches.
 
     Args:
@@ -696,6 +738,7 @@ def _predict(
         )
     )
     _, contact = locate_contacts(sampled)[setup]
+    sensor = sampled.setups[setup].sensor
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
     gauge, differences = sampled.gauges[sampled.setups[setup].gauge], stops[first].role != "reading"
@@ -704,10 +747,10 @@ def _predict(
         predicted = predicted - predicted[ends[first] - 1]
         if not differences:
             predicted += gauge.middle
-    finished, probed = [], probing_direction(session.setups[setup].sensor) is not None
+    finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
-        if i > 0 and not probed:  # the gauge is mounted at the first stop; a probe touches nothing
+        if i > 0 and has_dial(sensor):  # the gauge is mounted at the first stop
             start = end - len(paths[i].points)
             on_path = predicted[start:end]
             problems = [p for p in contact.problems[start:end] if p]
