@@ -195,7 +195,8 @@ def test_names_from_files_are_shown_unchanged(table1):
     ]
     names = [f"{name}.offset" for name in NAMES[:3]]
     parameters = [replace(p, name=n) for p, n in zip(table1.parameters, names, strict=True)]
-    strange = replace(table1, residuals=tuple(rows), parameters=tuple(parameters))
+    setups = tuple(replace(table1.setups[0], name=name) for name in NAMES)
+    strange = replace(table1, setups=setups, residuals=tuple(rows), parameters=tuple(parameters))
     found = {}
     for plot in PLOTS:
         svg = plot(strange)
