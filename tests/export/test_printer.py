@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from calibrated import SOUND, UNJUDGED
 from commands import run_orthocal
-from simulated_printer import Printer, nominal, read_settings, rings, write_log
+from simulated_printer import Printer, nominal, read_settings, rings, write_log, write_settings
 
 from orthocal import (
     ExportError,
@@ -244,6 +244,63 @@ def test_settings_that_were_not_entered_are_named(calibrated, tmp_path):
     numbers = [stated.numbers[f"layer_{name}_um"] for name in ("now", "best")]
     assert numbers == pytest.approx(np.array(errors) / UM, rel=1e-6)
     assert numbers[0] > 5.0 * numbers[1]
+
+
+@pytest.mark.parametrize(
+    ("active", "kind", "names"),
+    [
+        (lambda _, new: new, None, ()),
+        (lambda old, _: old, "settings not entered", ()),
+        (
+            lambda old, new: replace(new, endstops=old.endstops),
+            "settings not entered",
+            ["endstops"],
+        ),
+        (
+            lambda old, new: replace(old, endstops=new.endstops),
+            "settings not entered",
+            ["radius", "rods", "tower angles"],
+        ),
+        (
+            lambda old, new: replace(new, angles=np.array([*new.angles[:1], *old.angles[1:]])),
+            "settings not entered",
+            ["angle of tower b"],
+        ),
+        (
+            lambda _, new: replace(new, endstops=new.endstops[[2, 1, 0]]),
+            "settings interchanged",
+            ["endstops of towers a and c"],
+        ),
+    ],
+)
+def test_active_settings_that_a_log_does_not_state_are_named(
+    calibrated, tmp_path, active, kind, names
+):
+    """Positions in the console belong to the active settings, and are read with the stated ones.
+
+    The angle of tower c is the same in both.
+    """
+    printer, calibration = calibrated
+    lines = FIRMWARES["klipper"].config_lines(fit_firmware(calibration, "klipper").settings)
+    stated, rng = read_settings("klipper", lines), np.random.default_rng(5)
+    z = printer.probe(active(nominal(), stated), rings(), noise=NOISE_MM, rng=rng)
+    cfg, log = tmp_path / "printer.cfg", tmp_path / "log.txt"
+    cfg.write_text(f"{write_settings('klipper', stated)}[probe]\nz_offset: {TRIGGER_MM}\n")
+    points = zip(rings(), z, strict=True)
+    log.write_text("".join(f"probe at {x:.3f},{y:.3f} is z={h:.6f}\n" for (x, y), h in points))
+    validation = validate_calibration(calibration, import_printer_log(log, settings=[cfg]).session)
+    assert validation.confirmed == (kind is None)
+    if kind is None:
+        assert validation.mistake is None
+        return
+    assert (validation.mistake.explanation.kind, validation.mistake.explanation.names) == (
+        kind,
+        tuple(names),
+    )
+    decision = validation.assessment.decision
+    assert (decision.verdict, decision.exit_code) == ("review", 3)
+    assert "Compare printer.cfg" in decision.action
+    assert "probe again" in decision.action
 
 
 def test_the_second_probing_ends_the_walk(calibrated, probed_again):

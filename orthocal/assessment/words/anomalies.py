@@ -423,6 +423,8 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
         "offsets entered twice": lambda: _entered(e, "added twice"),
         "offsets interchanged": lambda: _entered(e, "interchanged"),
+        "settings not entered": lambda: _settings(e),
+        "settings interchanged": lambda: _settings(e),
         "backlash not entered": lambda: _compensated(session, e),
         "backlash halved": lambda: _compensated(session, e),
         "backlash entered twice": lambda: _compensated(session, e),
@@ -618,6 +620,16 @@ def _entered(e: Explanation, how: str) -> str:
     """Clause about wrongly entered offsets."""
     which = "offset of {} was" if len(e.drives) == 1 else "offsets of {} were"
     return f"in session {e.sessions[0]} the {which.format(joined(e.drives))} {how}"
+
+
+def _settings(e: Explanation) -> str:
+    """Clause about settings of a printer's firmware that were not active as stated."""
+    if e.kind == "settings interchanged":
+        return f"in session {e.sessions[0]} the firmware had interchanged {joined(e.names)}"
+    return (
+        f"the settings that session {e.sessions[0]} states were not active: the firmware still had "
+        f"the previous {joined(e.names or ('settings',))}"
+    )
 
 
 def _compensated(session: Session, e: Explanation) -> str:
