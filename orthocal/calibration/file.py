@@ -24,7 +24,7 @@ from orthocal.io.files import exists, is_folder, require_suffix, write_file
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
 
-SCHEMA = "orthocal/calibration/15"
+SCHEMA = "orthocal/calibration/16"
 
 DERIVED_TOLERANCE = 1e-9
 """Largest relative difference of a derived number from its recomputed value."""

@@ -38,6 +38,7 @@ AnomalyKind = Literal[
     "backlash entered twice",
     "settings not entered",
     "settings interchanged",
+    "bed moved",
     "machine changed",
     "lost steps",
 ]

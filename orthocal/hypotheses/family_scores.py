@@ -11,7 +11,7 @@ from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.lost_steps import lost_steps
-from orthocal.hypotheses.families.printer_settings import wrong_printer_settings
+from orthocal.hypotheses.families.printer_settings import changes_between_logs
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.sessions import changes_between_sessions
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
@@ -283,8 +283,7 @@ def list_families(model: LinearModel, rows: Rows, *, grouped: bool) -> Iterator[
     yield from swapped_rows(rows)
     yield from row_offsets(rows)
     yield from changes_between_sessions(model)
-    if len(model.labels) > 1:
-        yield from wrong_printer_settings(model)
+    yield from changes_between_logs(model)
     yield from lost_steps(model, rows)
 
 

@@ -11,7 +11,7 @@ with the notation of `tool_indicator`, and o the trigger height of the probe.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import casadi as ca
@@ -120,7 +120,7 @@ class Probe(ToolIndicator):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and form of the surface, and the trigger height."""
-        surface = self._artefact_parameters()
+        surface = tuple(replace(p, fixed=True) for p in self._artefact_parameters())
         trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
         return (*surface, *trigger)
 

@@ -21,16 +21,18 @@ from orthocal import (
     draw_errors,
     draw_scene,
     export_calibration,
+    join_sessions,
     load_calibration,
     load_session,
     validate_calibration,
     write_calibration,
 )
 from orthocal.assessment.printer_settings import _find_targets, fit_firmware
-from orthocal.calibration.refit import restore_covariances
+from orthocal.calibration.refit import restore_covariances, restore_session
 from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.importing.printer_log import import_printer_log
+from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.output.scene.tool_errors import TOOL_ENTERED
 from orthocal.output.text.accuracy import FIRMWARE_NOTE
 from orthocal.output.text.answer import PRINT
@@ -271,6 +273,11 @@ def test_settings_that_were_not_entered_are_named(calibrated, tmp_path):
             "settings interchanged",
             ["endstops of towers a and c"],
         ),
+        (
+            lambda _, new: replace(new, endstops=np.add(new.endstops, [0.25, -0.25, 0.0])),
+            "bed moved",
+            [],
+        ),
     ],
 )
 def test_active_settings_that_a_log_does_not_state_are_named(
@@ -292,6 +299,8 @@ def test_active_settings_that_a_log_does_not_state_are_named(
     assert validation.confirmed == (kind is None)
     if kind is None:
         assert validation.mistake is None
+        assert validation.refit.rms_before == pytest.approx(validation.expected_rms, rel=0.5)
+        assert validation.expected_rms < 2.0 * NOISE_MM * MM
         return
     assert (validation.mistake.explanation.kind, validation.mistake.explanation.names) == (
         kind,
@@ -299,8 +308,29 @@ def test_active_settings_that_a_log_does_not_state_are_named(
     )
     decision = validation.assessment.decision
     assert (decision.verdict, decision.exit_code) == ("review", 3)
-    assert "Compare printer.cfg" in decision.action
+    assert "printer.cfg" in decision.action
     assert "probe again" in decision.action
+
+
+def test_logs_of_a_printer_share_their_bed_unless_its_setup_has_another_name(calibrated):
+    """Another sensor of a machine is mounted anew in each session."""
+    _, calibration = calibrated
+    one = restore_session(calibration)
+    bed = one.setups["bed"]
+    remounted = replace(
+        one,
+        setups={"bed2": replace(bed, name="bed2")},
+        readings=tuple(replace(r, setup="bed2") for r in one.readings),
+    )
+    without = [replace(s, firmware=None) for s in (one, one)]
+    for sessions, names in (
+        ((one, one), {"setup.bed"}),
+        ((one, remounted), {"setup.bed", "setup.bed2"}),
+        (without, {"setup.session-1/bed", "setup.session-2/bed"}),
+    ):
+        joined = join_sessions([replace(s, sha256="", path=None) for s in sessions])
+        parameters = nuisance_parameters(joined).parameters
+        assert {p.name for p in parameters} == {f"{n}.{k}" for n in names for k in ("yaw", "roll")}
 
 
 def test_the_second_probing_ends_the_walk(calibrated, probed_again):

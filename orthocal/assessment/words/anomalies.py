@@ -425,6 +425,10 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets interchanged": lambda: _entered(e, "interchanged"),
         "settings not entered": lambda: _settings(e),
         "settings interchanged": lambda: _settings(e),
+        "bed moved": lambda: (
+            f"the bed was tilted before session {e.sessions[0]}, or endstops differ from those "
+            "that it states"
+        ),
         "backlash not entered": lambda: _compensated(session, e),
         "backlash halved": lambda: _compensated(session, e),
         "backlash entered twice": lambda: _compensated(session, e),

@@ -198,6 +198,12 @@ def _advise_about_logs(session: Session, firmware: FirmwareName, e: Explanation)
             "enter those of the export, home, probe again and import the new log. If they agree, "
             "the log is older: import it again with the settings of its time."
         )
+    if e.kind == "bed moved":
+        return (
+            f"Compare the endstops in {ACTIVE_SETTINGS[firmware]} with those of the export. If "
+            "they differ, enter those of the export, home, probe again and import the new log. If "
+            "they agree, the bed has moved: calibrate the last log alone and export its settings."
+        )
     imported = ""
     if len({part.firmware for part in session.parts}) == 1:
         imported = (

@@ -20,8 +20,11 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
+from orthocal.hypotheses.families.sessions import divide_sessions
 from orthocal.hypotheses.hypothesis import Family, Patterns, sparse_rows
 from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.row_changes import nuisance_columns
+from orthocal.observation.sensor_groups import fixed_parameters
 from orthocal.printers.settings import DeltaSettings
 from orthocal.sensors.protocol import reads_pairs, states_readings
 from orthocal.session.session import Session, split_label
@@ -46,7 +49,14 @@ Mistake = tuple[AnomalyKind, tuple[str, ...], Array]
 in `_to_vector`."""
 
 
-def wrong_printer_settings(model: LinearModel) -> Iterator[Family]:
+def changes_between_logs(model: LinearModel) -> Iterator[Family]:
+    """Changes between the logs of a printer: of its active settings, or of its bed."""
+    if len(model.labels) > 1 and model.problem.session.firmware is not None:
+        yield from _wrong_settings(model)
+        yield from _moved_bed(model)
+
+
+def _wrong_settings(model: LinearModel) -> Iterator[Family]:
     """Settings of an earlier log that were active in a later one, or interchanged settings."""
     session = model.problem.session
     settings_of = _settings_by_label(session)
@@ -67,6 +77,26 @@ def wrong_printer_settings(model: LinearModel) -> Iterator[Family]:
     if explanations:
         edits = Patterns(sparse_rows(rows, changes, len(session.readings)))
         yield Family.of(explanations, edits=edits)
+
+
+def _moved_bed(model: LinearModel) -> Iterator[Family]:
+    """A bed with another tilt and form from a log on."""
+    session = model.problem.session
+    names = model.problem.free[model.problem.n_machine :]
+    fixed = [i for i, name in enumerate(names) if name in fixed_parameters(session)]
+    columns = nuisance_columns(model)[fixed]
+    label_of_row = [split_label(r.setup, joined=True)[0] for r in session.readings]
+    explanations, groups = [], []
+    for sessions, apart in divide_sessions(model.order):
+        labels = tuple(model.labels[k] for k in sessions)
+        later = np.isin(label_of_row, labels)
+        sizes = [np.abs(columns[:, rows]).max(axis=1, initial=0.0) for rows in (later, ~later)]
+        shared = np.minimum(*sizes) > model.sigma
+        if shared.any() and not apart:
+            explanations.append(Explanation("bed moved", "session", sessions=labels[:1]))
+            groups.append(np.where(later, columns, 0.0)[shared] / sizes[0][shared, None])
+    if explanations:
+        yield Family.of(explanations, groups=groups)
 
 
 def enter_settings_wrongly(before: DeltaSettings, stated: DeltaSettings) -> Iterator[Mistake]:
