@@ -31,7 +31,7 @@ from orthocal.assessment.printer_settings import _find_targets, fit_firmware
 from orthocal.calibration.refit import restore_covariances, restore_session
 from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.measurement.importing.printer_log import import_printer_log
+from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.output.scene.tool_errors import TOOL_ENTERED
 from orthocal.output.text.accuracy import FIRMWARE_NOTE
@@ -310,6 +310,25 @@ def test_active_settings_that_a_log_does_not_state_are_named(
     assert (decision.verdict, decision.exit_code) == ("review", 3)
     assert "printer.cfg" in decision.action
     assert "probe again" in decision.action
+
+
+def test_no_command_names_sessions_that_are_not_found_from_here(calibrated, tmp_path, monkeypatch):
+    """Paths of a calibration are those of the directory in which it was made."""
+    printer, calibration = calibrated
+    for name, seed in (("one", 2), ("two", 4)):
+        log = tmp_path / f"{name}.txt"
+        log.write_text(probe_log("klipper", printer, nominal(), np.random.default_rng(seed)))
+        write_printer_import(import_printer_log(log), tmp_path / name)
+    record = replace(calibration.session, path="one/session.yaml")
+    calibration = replace(calibration, session=record)
+    monkeypatch.chdir(tmp_path)
+    validation = validate_calibration(calibration, load_session("two"))
+    assert "orthocal calibrate one two " in to_text(render_validation(validation))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    shown = " ".join(to_text(render_validation(validation)).split())
+    assert "orthocal calibrate" not in shown
+    assert "in the directory in which the calibration was made" in shown
 
 
 def test_logs_of_a_printer_share_their_bed_unless_its_setup_has_another_name(calibrated):

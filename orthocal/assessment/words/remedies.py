@@ -91,8 +91,13 @@ def advise_repetition(session: Session, *explanations: Explanation) -> str:
             repeat = (
                 "Measure again and correct the command DELTA_ANALYZE, then import the log again"
             )
-        lines = [r.line for r in rows if r.line is not None]
-        omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
+        concerned = {i for e in explanations for i in e.rows}
+        setups = {r.setup for r in rows}
+        if 2 * len(concerned) > sum(r.setup in setups for r in session.readings):
+            return f"{repeat}."
+        lines = sorted({r.line for r in rows if r.line is not None})
+        name = quote_path(rows[0].file) if session.joined and rows[0].file else "readings.csv"
+        omitted = f"delete {spans(lines, 'line')} of {name}" if lines else "leave it out"
         return f"{repeat}. Or {omitted}, and calibrate again."
     what = "it" if len(rows) == 1 else "these"
     file = rows[0].file or session.readings_path
