@@ -22,6 +22,7 @@ from orthocal import (
     draw_scene,
     export_calibration,
     join_sessions,
+    judge_session,
     load_calibration,
     load_session,
     validate_calibration,
@@ -377,6 +378,17 @@ def test_the_second_probing_ends_the_walk(calibrated, probed_again):
     assert (np.array(sizes[0]) <= sizes[1]).all()  # of both beds, only that of the last counts
     assert PRINT in to_text(render_validation(validation))
     assert describe_next(fit, Path("one"), Path("new")).startswith("Next: print.")
+
+
+def test_old_settings_that_are_given_last_are_noted(calibrated, probed_again):
+    """Only new ones have corrections of single towers."""
+    old = replace(restore_session(calibrated[1]), sha256="")
+    for sessions, noted in (([old, probed_again], False), ([probed_again, old], True)):
+        orders = [
+            f for f in judge_session(join_sessions(sessions)).findings if f.kind == "wrong order"
+        ]
+        assert [f.severity for f in orders] == ["note"] * noted
+        assert all("settings are assumed" in f.text for f in orders)
 
 
 def test_an_endstop_that_moved_is_named(calibrated, probed_again):

@@ -246,16 +246,18 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
-def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
+def describe_wrong_order(given: str, last: str, *, timed: bool, firmware: bool) -> Finding:
     """Finding about joined sessions that were not given in the order of measuring.
 
     Args:
         given: Session that was given last.
         last: Session that was measured last.
-        timed: Whether the times of the readings state this; otherwise the active offsets.
+        timed: Whether the times of the readings state this; otherwise the active numbers.
+        firmware: Whether these are settings of a printer's firmware, not offsets.
     """
+    numbers = "settings" if firmware else "offsets"
     assumed = (
-        f"The present offsets are assumed to be those of session {given}, which was given last."
+        f"The present {numbers} are assumed to be those of session {given}, which was given last."
     )
     if timed:
         return review(
@@ -265,7 +267,8 @@ def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
         )
     return note(
         "wrong order",
-        f"{assumed} But its controller corrects nothing, unlike that of session {last}.",
+        f"{assumed} But its {'firmware' if firmware else 'controller'} corrects nothing, unlike "
+        f"that of session {last}.",
         f"If session {last} is the latest, give it last.",
     )
 
@@ -423,12 +426,9 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
         "offsets entered twice": lambda: _entered(e, "added twice"),
         "offsets interchanged": lambda: _entered(e, "interchanged"),
-        "settings not entered": lambda: _settings(e),
-        "settings interchanged": lambda: _settings(e),
-        "bed moved": lambda: (
-            f"the bed was tilted before session {e.sessions[0]}, or endstops differ from those "
-            "that it states"
-        ),
+        "settings not entered": lambda: _between_logs(e),
+        "settings interchanged": lambda: _between_logs(e),
+        "bed moved": lambda: _between_logs(e),
         "backlash not entered": lambda: _compensated(session, e),
         "backlash halved": lambda: _compensated(session, e),
         "backlash entered twice": lambda: _compensated(session, e),
@@ -626,8 +626,13 @@ def _entered(e: Explanation, how: str) -> str:
     return f"in session {e.sessions[0]} the {which.format(joined(e.drives))} {how}"
 
 
-def _settings(e: Explanation) -> str:
-    """Clause about settings of a printer's firmware that were not active as stated."""
+def _between_logs(e: Explanation) -> str:
+    """Clause about settings of a printer's firmware that were not active as stated, or its bed."""
+    if e.kind == "bed moved":
+        return (
+            f"the bed was tilted before session {e.sessions[0]}, or endstops differ from those "
+            "that it states"
+        )
     if e.kind == "settings interchanged":
         return f"in session {e.sessions[0]} the firmware had interchanged {joined(e.names)}"
     return (

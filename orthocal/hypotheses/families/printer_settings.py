@@ -24,13 +24,11 @@ from orthocal.hypotheses.families.sessions import divide_sessions
 from orthocal.hypotheses.hypothesis import Family, Patterns, sparse_rows
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.row_changes import nuisance_columns
+from orthocal.measurement.joining import settings_of_sessions
 from orthocal.observation.sensor_groups import fixed_parameters
-from orthocal.printers.settings import DeltaSettings
+from orthocal.printers.settings import EQUAL, DeltaSettings
 from orthocal.sensors.protocol import reads_pairs, states_readings
 from orthocal.session.session import Session, split_label
-
-SAME = 1e-9
-"""Largest difference of equal settings, [m, rad]."""
 
 PARTS = {
     "radius": [0],
@@ -59,7 +57,7 @@ def changes_between_logs(model: LinearModel) -> Iterator[Family]:
 def _wrong_settings(model: LinearModel) -> Iterator[Family]:
     """Settings of an earlier log that were active in a later one, or interchanged settings."""
     session = model.problem.session
-    settings_of = _settings_by_label(session)
+    settings_of = settings_of_sessions(session)
     explanations, rows, changes = [], [], []
     before: DeltaSettings | None = None
     for label in (model.labels[k] for k in model.order.tolist()):
@@ -110,10 +108,10 @@ def enter_settings_wrongly(before: DeltaSettings, stated: DeltaSettings) -> Iter
     """
     old, new = _to_vector(before), _to_vector(stated)
     seen = [new]
-    if np.abs(old - new).max() <= SAME:
+    if np.abs(old - new).max() <= EQUAL:
         return
     for kind, names, active in (*_keep(old, new, stated), *_interchange(new)):
-        if min(np.abs(active - other).max() for other in seen) > SAME:
+        if min(np.abs(active - other).max() for other in seen) > EQUAL:
             seen.append(active)
             yield kind, names, active
 
@@ -220,30 +218,3 @@ class _Log:
         lengths = [np.linalg.norm(p[:, 0] - p[:, 1], axis=1) for p in (stated, actual)]
         heights = actual[:, 0, 2] - stated[:, 0, 2]
         return np.where(self.heights, heights, lengths[1] - lengths[0])
-
-
-def _settings_by_label(session: Session) -> dict[str, DeltaSettings]:
-    """Stated settings of joined sessions by label, in the coordinates of the joined session.
-
-    Those of a session that was joined before and has no parts are unknown, except of its last one.
-    """
-    if session.firmware is None:
-        return {}
-    settings = _list_settings(session)
-    labels = list(dict.fromkeys(session.labels))
-    if len(settings) != len(labels):
-        return {}
-    homed = np.array(session.firmware.homed)
-    return {
-        label: s.moved(homed - s.homed)
-        for label, s in zip(labels, settings, strict=True)
-        if s is not None
-    }
-
-
-def _list_settings(session: Session) -> list[DeltaSettings | None]:
-    """Stated settings of the sessions of which a session consists."""
-    if session.joined and session.parts:
-        return [s for part in session.parts for s in _list_settings(part)]
-    unknown = len(set(session.labels)) - 1
-    return [*[None] * unknown, session.firmware]
