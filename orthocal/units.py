@@ -104,6 +104,11 @@ def to_mm(value: float) -> float:
     return tidy(value / MM)
 
 
+def show_mm(value: float) -> str:
+    """A length in mm to 1 µm, without trailing zeros."""
+    return f"{round(value / MM, 3) + 0.0:.12g}"
+
+
 def tidy(value: float) -> float:
     """A number rounded to 12 significant digits, without the rounding error of a conversion."""
     return float(f"{value:.12g}") + 0.0

@@ -56,12 +56,16 @@ class Sheet:
     def row(self):
         return np.array([int(self.rng.integers(self.values.size))])
 
+    @property
+    def legs(self):
+        """Legs that are read; with a sensor at the tool, its frames, too."""
+        return sorted({s.sensor.place for s in self.session.setups.values()})
+
     def leg(self):
-        legs = sorted({s.sensor.leg for s in self.session.setups.values()})
-        return legs[self.rng.integers(len(legs))]
+        return self.legs[self.rng.integers(len(self.legs))]
 
     def of_leg(self, leg):
-        names = [n for n, s in self.session.setups.items() if s.sensor.leg == leg]
+        names = [n for n, s in self.session.setups.items() if s.sensor.place == leg]
         return np.concatenate([self.setups[n] for n in names])
 
     @property
@@ -133,6 +137,8 @@ def plain_mistakes() -> dict[str, Make]:
 
     def apart(s: Sheet):
         rows = s.pick(s.cycles)
+        if rows.size < 2:
+            return None
         i, j = sorted(s.rng.choice(rows.size, 2, replace=False))
         return s.swapped(rows[[i]], rows[[j]]) if j > i + 1 else s.swapped(rows[[0]], rows[[-1]])
 
@@ -164,8 +170,10 @@ def plain_mistakes() -> dict[str, Make]:
         return s.swapped(np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]))
 
     def legs(s: Sheet):
-        a, b = s.rng.choice(["x", "y", "z"], 2, replace=False)
-        return s.swapped(s.of_leg(a), s.of_leg(b))
+        if len(s.legs) < 2:
+            return None
+        one, other = (s.of_leg(s.legs[i]) for i in s.rng.choice(len(s.legs), 2, replace=False))
+        return s.swapped(one, other) if one.size == other.size else None
 
     def backwards(s: Sheet):
         rows = s.pick(s.setups)

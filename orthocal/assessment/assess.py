@@ -62,6 +62,7 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
 KEEPING: dict[FindingKind, str] = {
     "no offset": words.NOTHING_HEADLINE,
     "no change needed": words.KEEP_HEADLINE,
+    "settings unknown": words.FIRMWARE_KEEP_HEADLINE,
     "no sensitivity": words.KEEP_HEADLINE,
     "no deviation": words.KEEP_HEADLINE,
 }
@@ -323,7 +324,7 @@ def _no_change_needed(entries: Sequence[ControllerEntry], best: ToolErrorSummary
 
 
 def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -> list[Finding]:
-    """Finding about the settings of a firmware: others are better, or hardly so."""
+    """Finding about the settings of a firmware: others are better, or hardly so, or unknown."""
     settings = calibration.session.firmware
     if settings is None:
         return []
@@ -331,8 +332,8 @@ def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -
 
     try:
         fit = fit_firmware(calibration, settings.firmware, tool=tool)
-    except ExportError:  # no bed, or no workspace; the export names it
-        return []
+    except ExportError as e:  # as `orthocal export` says, too
+        return [words.settings_unknown(e.problem)]
     return [
         words.settings_change(
             tool=tuple(fit.expect_tool(e) for e in (fit.now, fit.new)),

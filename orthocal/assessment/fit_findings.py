@@ -20,12 +20,12 @@ from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
-from orthocal.observation.gauge_noise import SMALLEST_SIGMA, noise_floor
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA, assumed_sigma, noise_floor
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Session, split_label
+from orthocal.session.session import Gauge, Session, split_label
 from orthocal.statistics.zeros import project_out_zeros
 
 STANDSTILL = 1e-6
@@ -136,7 +136,7 @@ def _residuals_of(calibration: Calibration, gauge: GaugeRecord) -> Finding:
     ):
         return words.gauge_overstated(noise.residual_sigma, stated, of_gauge)
     if noise.source == "unknown":
-        return words.noise_unknown()
+        return words.noise_unknown(assumed_sigma(Gauge(stated, gauge.resolution)))
     if noise.source == "gauge":
         if calibration.is_checked:
             return words.fits(noise.sigma, STATED)

@@ -176,7 +176,8 @@ def fit_firmware(
         tool: Tool error after the calibration; by default that of its assessment.
 
     Raises:
-        ExportError: If the session states no settings, or the machine does not reach the workspace.
+        ExportError: If the session states no settings, the machine does not reach the workspace, no
+            setup measured the bed, or the best settings are implausible.
     """
     from scipy.optimize import least_squares
 
@@ -196,6 +197,11 @@ def fit_firmware(
         method="lm",
     )
     settings = _apply_changes(start, columns @ solution.x)
+    if problem := settings.find_problem():
+        raise ExportError(
+            f"the best settings are implausible: {problem}. Compare the settings of the log with "
+            "those of the printer: others may have been active while the bed was probed"
+        )
     if tool is None and calibration.assessment is not None:
         tool = calibration.assessment.tool
     homed_change = np.array(settings.homed) - present.homed
@@ -362,7 +368,10 @@ def _find_bed(calibration: Calibration) -> str:
     """
     beds = [s.name for s in calibration.setups if s.sensor.kind == "probe"]
     if not beds:
-        raise ExportError("no setup measured the bed with a probe: the plane of prints is unknown")
+        raise ExportError(
+            "these readings determine no settings: no setup measured the bed with a probe, so the "
+            "plane of prints is unknown. Calibrate them together with the log of a probed bed"
+        )
     return beds[-1]
 
 

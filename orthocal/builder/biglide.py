@@ -100,14 +100,9 @@ class Biglide(SlidingLegs):
             loops.append(Loop("platform", ("y_leg_tip", "y_pin"), "3d", PLANAR_ROWS))
             sums = length_sums(self.letters)
         return robot_yaml(
-            self.title,
-            letters=self.letters,
-            zero=self.zero,
-            rod_radius=self.rod_radius,
+            self,
             loops=loops,
             parameters=sums,
             tip="{k}_end" if self.single else "{k}_leg_tip",
             rods=ONE_ROD if self.single else TWO_RODS,
-            coordinates=self.coordinates,
-            workspace=self.workspace,
         )

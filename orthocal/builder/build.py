@@ -25,7 +25,8 @@ from orthocal.builder.orthoglide import FEET
 from orthocal.effects.loading import load_robot
 from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
-from orthocal.io.files import read_file, write_files
+from orthocal.io.documents import read_text
+from orthocal.io.files import write_files
 from orthocal.robot.loading import find_robot_files
 from orthocal.robot.model import Robot
 
@@ -136,9 +137,11 @@ def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None
     yaml_file = find_robot_files(folder)[0]
     if yaml_file.name == MACHINE:
         raise RobotError(f"contains {MACHINE} but no YAML of a robot", where=str(folder))
-    name, description = yaml_file.stem, read_file(yaml_file, error=RobotError)
     files = describe_machine(
-        dimensions, name=name, counting=counting, description=description.decode("utf-8", "replace")
+        dimensions,
+        name=yaml_file.stem,
+        counting=counting,
+        description=read_text(yaml_file, error=RobotError),
     )
     del files[MACHINE]
     with tempfile.TemporaryDirectory(prefix="orthocal-") as temporary:
@@ -182,7 +185,7 @@ def _complete_yaml(
             raise RobotError(
                 f"has no line '{drive}: {{zero_mm: ...}}'; expected one for its zero", where=file
             )
-    box = box_text(dimensions.workspace)
+    box = box_text(dimensions.box)
     if box:  # without it, a workspace in the YAML is preserved
         text = _WORKSPACE_KEY.sub("", text)
         place = _ORTHOCAL_KEY.search(text)

@@ -136,6 +136,11 @@ class Dimensions(ABC):
         """
 
     @property
+    def box(self) -> tuple[tuple[float, float], ...] | None:
+        """Limits of the workspace, [m]; None for the largest cube that the machine reaches."""
+        return self.workspace
+
+    @property
     @abstractmethod
     def words(self) -> str:
         """Description of the dimensions, in mm."""

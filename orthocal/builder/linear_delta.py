@@ -108,17 +108,17 @@ class LinearDelta(Dimensions):
 
     @property
     def box(self) -> tuple[tuple[float, float], ...]:
-        """Limits of the workspace, [m]: the stated one, or a reachable box.
+        """Limits of the workspace, [m]: the stated one, or a box that the rods reach.
 
         The box extends at most half the radius to each side. Its limits are whole centimetres, or
-        whole millimetres on small machines.
+        whole millimetres in small boxes.
         """
         if self.workspace is not None:
             return self.workspace
-        step = 0.01 if self.radius >= 0.1 else 0.001
         half = min(
             0.5 * self.radius, (MAX_RELATIVE_DISTANCE * self.rod - self.radius) / math.sqrt(2.0)
         )
+        step = 0.01 if half >= 0.05 else 0.001
         half = step * math.floor(half / step + 0.5)
         near = max(self.radius - math.sqrt(2.0) * half, 0.0)
         top = min(self.radius, self.travel[1] - math.sqrt(self.rod**2 - near**2))
@@ -217,13 +217,9 @@ class LinearDelta(Dimensions):
             **{f"{k}_rod_b.length": [f"frame.{k}_rod_b_tip.x"] for k in towers},
         }
         return robot_yaml(
-            self.title,
-            letters=towers,
-            zero=self.zero,
-            rod_radius=self.rod_radius,
+            self,
             loops=platform_loops(towers),
             parameters=parameters,
             models={"delta": DELTA_MODEL},
-            workspace=self.box,
             tolerances="offset_mm: 4, translation_mm: 1, rotation_mrad: 5, scale_ppm: 500",
         )

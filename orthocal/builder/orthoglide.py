@@ -37,9 +37,6 @@ SLIDER_DISTANCE = 0.03
 RAIL_OVERHANG = 0.09
 """Length of a rail minus the travel, [m]."""
 
-ORTHOGONAL = math.asin(1.0 / math.sqrt(3.0))
-"""Elevation of the slides of an Orthoglide, [rad]."""
-
 MIN_ELEVATION, MAX_ELEVATION = 20.0 * DEG, 70.0 * DEG
 """Limits of the elevation of the slides of an inclined Orthoglide, [rad]."""
 
@@ -76,10 +73,9 @@ class SlidingLegs(Dimensions):
 
     def find_problem(self) -> tuple[str, str] | None:
         """Name and problem of the first impossible dimension; None if all are possible."""
-        return find_length_problem("leg", "legs", self.leg) or self._find_others()
-
-    def _find_others(self) -> tuple[str, str] | None:
-        """Name and problem of the first impossible dimension after the leg length."""
+        problem = find_length_problem("leg", "legs", self.leg)
+        if problem:
+            return problem
         leg, (lower, upper) = self.leg, self.travel
         travel = f"travel from {in_mm(lower)} to {in_mm(upper)} mm"
         if not lower < leg < upper:
@@ -169,13 +165,7 @@ class SlidingLegs(Dimensions):
     def yaml(self) -> str:
         """YAML of the machine."""
         return robot_yaml(
-            self.title,
-            letters=self.letters,
-            zero=self.zero,
-            rod_radius=self.rod_radius,
-            loops=platform_loops(self.letters),
-            parameters=length_sums(self.letters),
-            workspace=self.workspace,
+            self, loops=platform_loops(self.letters), parameters=length_sums(self.letters)
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from orthocal.builder.dimensions import box_text, in_mm
+from orthocal.builder.dimensions import Dimensions, box_text, in_mm
 
 WORKSHOP_TOLERANCES = "offset_mm: 10, translation_mm: 0.2, rotation_mrad: 2, scale_ppm: 200"
 """Default tolerances, of a machine built in a workshop."""
@@ -57,40 +57,30 @@ def length_sums(letters: str) -> dict[str, list[str]]:
 
 
 def robot_yaml(
-    title: str,
+    machine: Dimensions,
     *,
-    letters: str,
-    zero: float,
-    rod_radius: float,
     loops: Sequence[Loop],
     parameters: Mapping[str, Sequence[str]],
     models: Mapping[str, Sequence[str]] | None = None,
     rods: Mapping[str, tuple[str, str]] = TWO_RODS,
     tip: str = "{k}_leg_tip",
-    coordinates: str = "xyz",
-    workspace: Sequence[Sequence[float]] | None = None,
     tolerances: str = WORKSHOP_TOLERANCES,
 ) -> str:
     """YAML of a machine.
 
     Args:
-        title: Comment in the first line.
-        letters: Names of the legs.
-        zero: Coordinate of the slides in the mechanical zero, [m].
-        rod_radius: Radius of a rod, [m].
+        machine: Dimensions of the machine.
         loops: Loop closures.
         parameters: Named sums of errors.
         models: Free errors of models in addition to offsets, lengths and full.
         rods: Frames at both ends of each rod of a leg k.
         tip: Frame at the end of a leg k.
-        coordinates: Coordinates of the tool that the drives command.
-        workspace: Limits of the workspace relative to the mechanical zero, [m].
         tolerances: Tolerances as YAML.
     """
-    models = {**MODELS, **(models or {})}
-    box = [] if workspace is None else [f"  workspace: {{box_mm: {box_text(workspace)}}}"]
+    models, letters = {**MODELS, **(models or {})}, machine.letters
+    box = [] if machine.box is None else [f"  workspace: {{box_mm: {box_text(machine.box)}}}"]
     lines = [
-        f"# {title}",
+        f"# {machine.title}",
         *_gepetto_lines(letters, loops),
         "orthocal:",
         *box,
@@ -100,11 +90,11 @@ def robot_yaml(
         *(f"    {loop.name}: {{{_rows(loop.rows)}}}" for loop in loops),
         "  # Coordinates of the slides in the mechanical zero.",
         "  drives:",
-        *(f"    {k}_slide: {{zero_mm: {in_mm(zero)}}}" for k in letters),
+        *(f"    {k}_slide: {{zero_mm: {in_mm(machine.zero)}}}" for k in letters),
         "  # The line of each leg, and its rods, which a gauge touches.",
         "  legs:",
-        *(line for k in letters for line in _leg_lines(k, tip, rods, in_mm(rod_radius))),
-        f"  tcp: {{frame: tcp, coordinates: [{', '.join(coordinates)}]}}",
+        *(line for k in letters for line in _leg_lines(k, tip, rods, in_mm(machine.rod_radius))),
+        f"  tcp: {{frame: tcp, coordinates: [{', '.join(machine.coordinates)}]}}",
         "  # Named sums of elementary errors; '-' subtracts.",
         "  parameters:",
         *(f"    {name}: [{', '.join(members)}]" for name, members in parameters.items()),

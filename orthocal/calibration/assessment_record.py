@@ -82,6 +82,7 @@ FindingKind = Literal[
     "no offset",
     "no change needed",
     "settings improve",
+    "settings unknown",
     "must change",
     "not significant",
     "controller not stated",
@@ -349,8 +350,8 @@ class Assessment:
 
     @property
     def keeps_offsets(self) -> bool:
-        """True if the active offsets need no change."""
-        return bool(self.of_kind("no change needed", "no offset"))
+        """True if the active offsets, or the settings of a firmware, are not to be changed."""
+        return bool(self.of_kind("no change needed", "no offset", "settings unknown"))
 
     def of_kind(self, *kinds: FindingKind) -> tuple[Finding, ...]:
         """Findings of the stated kinds, in their order."""

@@ -15,7 +15,6 @@ import scipy
 from orthocal import __version__
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.file import absurd_result
 from orthocal.calibration.recorded_robot import record_robot
 from orthocal.calibration.records import (
     GaugeRecord,
@@ -26,7 +25,7 @@ from orthocal.calibration.records import (
     SolverRecord,
     Versions,
 )
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.diagnostics.deletion import (
     Diagnostics,
     cross_validate_setups,
@@ -84,6 +83,7 @@ def assemble_calibration(
     variances[2] += (bias[:, unmodelled_errors.scaled] ** 2).sum(axis=1)
     estimates = _estimates(fit, np.sqrt(variances))
     _require_possible(estimates, fit.iterations)
+    known = [hold_parameter(session.robot, *value) for value in problem.fixed.items()]
     diagnostics = diagnose_readings(fit)
     return Calibration(
         robot_record=record_robot(session),
@@ -91,7 +91,7 @@ def assemble_calibration(
         model=problem.selection.label,
         prior=bool(problem.machine_selection.prior.any()),
         solver=_solver_record(fit),
-        parameters=(*estimates[:n], *_held_parameters(problem)),
+        parameters=(*estimates[:n], *known),
         sensors=estimates[n:],
         model_covariance=read_only(covariances[0][:n, :n]),
         noise_covariance=read_only(covariances[1][:n, :n]),
@@ -111,12 +111,6 @@ def assemble_calibration(
         versions=_versions(),
         robot=session.robot,
     )
-
-
-def _held_parameters(problem: CalibrationProblem) -> list[ParameterEstimate]:
-    """Records of the known parameters, which are not estimated."""
-    robot = problem.session.robot
-    return [hold_parameter(robot, name, value) for name, value in problem.fixed.items()]
 
 
 def _separate_noise(fit: Fit) -> float | None:
@@ -144,6 +138,15 @@ def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -
     for p in estimates:
         if not max(abs(p.value), abs(p.linear)) <= LARGEST_NUMBER:
             raise absurd_result(f"{p.name} is {p.value:.3g} {p.unit}", iterations)
+
+
+def absurd_result(problem: str, iterations: int) -> SolverError:
+    """Error for a result with impossible numbers."""
+    return SolverError(
+        f"the result is implausible ({problem}); check readings, sigma_mm, tolerances and bounds",
+        status="absurd result",
+        iterations=iterations,
+    )
 
 
 def _solver_record(fit: Fit) -> SolverRecord:

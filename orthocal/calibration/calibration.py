@@ -103,12 +103,6 @@ class Calibration(CalibrationRecord):
         """True if there are enough redundant readings for residuals to check the model."""
         return self.redundancy >= MIN_DOF
 
-    @property
-    def suspicious(self) -> tuple[ResidualRow, ...]:
-        """Outliers among the rows, the worst first."""
-        rows = [r for r in self.residuals if abs(r.studentised) > self.critical]
-        return tuple(sorted(rows, key=lambda r: -abs(r.studentised)))
-
     def where(self, row: ResidualRow) -> str:
         """File and line of a row, for messages."""
         file = row.file or self.session.readings_path
@@ -288,9 +282,8 @@ class Calibration(CalibrationRecord):
 
     def row_sigma(self, row: ResidualRow) -> float:
         """Standard deviation of a row by the noise of its gauge, [m]."""
-        gauges = {s.name: s.gauge for s in self.setups}
-        noises = {g.name: g.noise for g in self.gauges}
-        noise = noises.get(gauges.get(row.setup, ""), self.noise)
+        gauge = next(s.gauge for s in self.setups if s.name == row.setup)
+        noise = next(g.noise for g in self.gauges if g.name == gauge)
         return noise.sigma * self.noise_factor(row)
 
     def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:

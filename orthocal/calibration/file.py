@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.calibration.build_record import absurd_result
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recorded_robot import load_recorded_robot, require_consistent
 from orthocal.calibration.records import CalibrationRecord
-from orthocal.errors import CalibrationFileError, SolverError
+from orthocal.calibration.refit import restore_session
+from orthocal.errors import CalibrationFileError
 from orthocal.io.documents import format_json, read_json, validate, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.io.files import exists, is_folder, require_suffix, write_file
+from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
 
@@ -82,7 +86,10 @@ def calibration_json(calibration: Calibration) -> str:
         SolverError: If it could not be loaded again; names the impossible number.
     """
     document = calibration_document(calibration)
-    _require_loadable(document, calibration)
+    try:
+        _read_document(document, "calibration.json", robot=calibration.robot)
+    except CalibrationFileError as e:
+        raise absurd_result(str(e), calibration.solver.iterations) from None
     return format_json(document)
 
 
@@ -96,23 +103,6 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     require_suffix(file, ".json", OTHER_KINDS)
     write_file(file, calibration_json(calibration))
     return file
-
-
-def _require_loadable(document: dict[str, Any], calibration: Calibration) -> None:
-    """Refuse a result that could not be loaded from its file."""
-    try:
-        _read_document(document, "calibration.json", robot=calibration.robot)
-    except CalibrationFileError as e:
-        raise absurd_result(str(e), calibration.solver.iterations) from None
-
-
-def absurd_result(problem: str, iterations: int) -> SolverError:
-    """Error for a result with impossible numbers."""
-    return SolverError(
-        f"the result is implausible ({problem}); check readings, sigma_mm, tolerances and bounds",
-        status="absurd result",
-        iterations=iterations,
-    )
 
 
 def _read_document(
@@ -148,6 +138,7 @@ def _read_document(
         robot=robot,
         path=path,
     )
+    _check_sensors(calibration, file)
     _check_estimates(calibration, file)
     _check_derived(data, _derive(calibration), file)
     return calibration
@@ -212,6 +203,20 @@ def _check_derived(
         )
 
 
+def _check_sensors(calibration: Calibration, file: str) -> None:
+    """Refuse nuisance parameters other than those of the setups."""
+    expected = [
+        (p.name, p.unit) for p in nuisance_parameters(restore_session(calibration)).parameters
+    ]
+    for i, (p, of_setups) in enumerate(zip_longest(calibration.sensors, expected)):
+        if p is None or (p.name, p.unit) != of_setups:
+            found = "nothing" if p is None else f"'{shorten(p.name)}' in {p.unit}"
+            wanted = "nothing" if of_setups is None else f"'{of_setups[0]}' in {of_setups[1]}"
+            raise CalibrationFileError(
+                f"found {found}; the setups have {wanted}", where=f"{file}: sensors[{i}]"
+            )
+
+
 def _check_estimates(calibration: Calibration, file: str) -> None:
     """Refuse standard deviations that contradict the covariances."""
     n = len(calibration.free)
@@ -246,10 +251,14 @@ def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]
     if unmodelled.leakage.shape != (n_free, n_unmodelled):
         expected = f"expected {n_free} × {n_unmodelled} numbers, free parameters × names"
         yield "unmodelled.leakage", expected
-    names = [p.name for p in record.parameters]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            yield f"parameters[{i}].name", f"'{name}' occurs twice"
+    for key in ("parameters", "sensors", "postures", "setups", "gauges"):
+        names = [part.name for part in getattr(record, key)]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                yield f"{key}[{i}].name", f"'{name}' occurs twice"
+    for i, gauge in enumerate(record.gauges):
+        if gauge.range is not None and not gauge.range[0] < gauge.range[1]:
+            yield f"gauges[{i}].range", "expected the lowest reading, then the highest"
     values, rank = record.identifiability.singular_values, record.identifiability.rank
     if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
         yield "identifiability.singular_values", "expected positive numbers, the largest first"

@@ -121,7 +121,7 @@ def _solver_options(
 
 
 def _fit_base(
-    problem: CalibrationProblem, *, options: SolverOptions | None, start: ArrayLike | None
+    problem: CalibrationProblem, *, options: SolverOptions | None, start: Array | None
 ) -> Fit:
     """Solve a problem in base parameters: linear combinations of inseparable parameters.
 
@@ -146,7 +146,9 @@ def _fit_base(
             break
         base_names = names
         reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(base_names))
-        fit = fit_problem(reduced, options=options, start=start)
+        of_reduced = [problem.free.index(name) for name in reduced.free]
+        reduced_start = None if start is None else start[of_reduced]
+        fit = fit_problem(reduced, options=options, start=reduced_start)
         sigma = max(fit.sigma, sigma)  # no more parameters than before
         if len(groups) > 1:
             weighted = problem.with_noise_ratio(fit.problem.noise_ratio)

@@ -15,7 +15,13 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
-from orthocal.calibration.records import CalibrationRecord, RobotFile, RobotRecord
+from orthocal.calibration.records import (
+    CalibrationRecord,
+    RobotFile,
+    RobotRecord,
+    SessionRecord,
+    SetupRecord,
+)
 from orthocal.effects.adjustment import require_adjustment
 from orthocal.effects.loading import (
     load_robot,
@@ -206,16 +212,13 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
     for i, name in enumerate(record.unmodelled.names):
         with _errors_at(f"{file}: unmodelled.names[{i}]"):
             robot.parameters[name]
-    for key, problem in (*_wrong_counts(record, robot), *_unknown_names(record)):
+    for key, problem in (*_wrong_counts(record, robot), *_unknown_names(record, robot)):
         raise CalibrationFileError(problem, where=f"{file}: {key}")
     for i, setup in enumerate(record.setups):
         with _errors_at(f"{file}: setups[{i}].reads"):
             setup.sensor.require_fit(robot, where=f"{file}: setups[{i}].reads")
-    for key, adjusted in (
-        ("session", record.session.adjusted),
-        *((f"setups[{i}]", s.adjusted or ()) for i, s in enumerate(record.setups)),
-    ):
-        for name, _ in adjusted:
+    for key, stating in _stating(record):
+        for name, _ in stating.adjusted or ():
             where = f"{file}: {key}.adjusted"
             require_adjustment(robot, name, where=where, error=CalibrationFileError)
     for i, row in enumerate(record.residuals):
@@ -247,13 +250,13 @@ def _wrong_counts(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str
         if len(p.passive) != n_passive:
             expected = f"expected {n_passive}, one per passive joint"
             yield f"postures[{i}].passive", f"has {len(p.passive)} numbers; {expected}"
-    offsets, names = record.session.controller_offsets, [d.name for d in robot.drives]
+    names = [d.name for d in robot.drives]
     expected = f"expected {len(names)}, one per drive: {', '.join(names)}"
-    if offsets is not None and len(offsets) != len(names):
-        yield "session.controller_offsets", f"has {len(offsets)} numbers; {expected}"
-    compensations = [("session", record.session.compensation)]
-    compensations += [(f"setups[{i}]", s.compensation or ()) for i, s in enumerate(record.setups)]
-    for key, joints in compensations:
+    for key, stating in _stating(record):
+        name = "active" if isinstance(stating, SetupRecord) else "controller_offsets"
+        offsets, joints = getattr(stating, name), stating.compensation or ()
+        if offsets is not None and len(offsets) != len(names):
+            yield f"{key}.{name}", f"has {len(offsets)} numbers; {expected}"
         if joints and len(joints) != len(names):
             yield f"{key}.compensation", f"has {len(joints)} items; {expected}"
         for i, joint in enumerate(joints):
@@ -267,13 +270,33 @@ def _wrong_counts(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str
                 )
 
 
-def _unknown_names(record: CalibrationRecord) -> Iterator[tuple[str, str]]:
-    """Keys with names of unknown setups and postures, with the problem."""
+def _stating(record: CalibrationRecord) -> Iterator[tuple[str, SessionRecord | SetupRecord]]:
+    """Keys and records of sessions and setups, which state what the controller corrected."""
+
+    def sessions(key: str, session: SessionRecord) -> Iterator[tuple[str, SessionRecord]]:
+        yield key, session
+        for i, part in enumerate(session.parts):
+            yield from sessions(f"{key}.parts[{i}]", part)
+
+    yield from sessions("session", record.session)
+    yield from ((f"setups[{i}]", setup) for i, setup in enumerate(record.setups))
+
+
+def _unknown_names(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str, str]]:
+    """Keys with names of unknown setups, postures, gauges and drives, with the problem."""
     postures, setups = {p.name for p in record.postures}, {s.name for s in record.setups}
-    references = [
-        (f"setups[{i}].aligned_at", s.aligned_at, "postures", postures)
-        for i, s in enumerate(record.setups)
-    ]
+    gauges, drives = {g.name for g in record.gauges}, {d.name for d in robot.drives}
+    read, references = {row.setup for row in record.residuals}, []
+    for i, setup in enumerate(record.setups):
+        references.append((f"setups[{i}].aligned_at", setup.aligned_at, "postures", postures))
+        if setup.name in read:
+            references.append((f"setups[{i}].gauge", setup.gauge, "gauges", gauges))
+    if record.assessment is not None:
+        for key in ("entries", "backlash"):
+            references += [
+                (f"assessment.{key}[{i}].drive", entry.drive, "drives", drives)
+                for i, entry in enumerate(getattr(record.assessment, key))
+            ]
     for i, row in enumerate(record.residuals):
         references += [
             (f"residuals[{i}].setup", row.setup, "setups", setups),

@@ -196,12 +196,14 @@ def restore_session(calibration: Calibration) -> Session:
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     record, robot = calibration.session, calibration.robot
     offsets = record.controller_offsets
+    gauges = {g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges}
+    unread = {s.gauge: Gauge() for s in calibration.setups if s.gauge not in gauges}
     return Session(
         robot=robot,
         robot_reference=calibration.robot_record.reference,
         title=record.title,
         source=record.source,
-        gauges={g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges},
+        gauges=gauges | unread,
         postures={p.name: p for p in calibration.postures},
         setups={
             s.name: Setup(

@@ -63,13 +63,13 @@ def again(
             tables of the last session. Motions beyond its soft limits are named.
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
-    from orthocal.export.formats import note_wrong_order, require_entering
+    from orthocal.export.formats import note_wrong_order, require_entering, require_offsets
     from orthocal.export.linuxcnc.entered_lines import states_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
-    _require_offsets(result, calibration)
+    require_offsets(result, where=str(calibration))
     if not anyway:
         require_entering(result)
     amounts = _read_amounts(result, adjusted, anyway=anyway)
@@ -243,20 +243,6 @@ def _list_lengths(drives: Sequence[Drive], values: Array) -> str:
         f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(drives, values.tolist(), strict=True)
     )
-
-
-def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:
-    """Refuse a printer, whose firmware has settings instead of offsets.
-
-    Raises:
-        ParameterError: If the session states a firmware.
-    """
-    if calibration.session.firmware is not None:
-        raise ParameterError(
-            "was made from a printer's log, and a printer has no offsets to enter; probe the bed "
-            "with the new settings, and `orthocal import` the new log",
-            where=str(path),
-        )
 
 
 def _read_amounts(

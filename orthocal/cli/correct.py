@@ -132,12 +132,13 @@ def correct(
         program (PROGRAM): G-code file; - for standard input.
         out (FILE): File for the corrected program; default: standard output.
     """
-    from orthocal.export.formats import require_entering, warn_against_verdict
+    from orthocal.export.formats import require_entering, require_offsets, warn_against_verdict
 
     controller = _read_controller(options)
     if out is not None:
         require_replaceable_file(out, force=force)
     result = orthocal.load_calibration(calibration)
+    require_offsets(result, where=str(calibration))
     if not anyway:
         require_entering(result)
     file = "standard input" if str(program) == "-" else str(program)

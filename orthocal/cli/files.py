@@ -233,11 +233,11 @@ def state_conditions(
         temperatures: Temperatures at the first and the last reading, [°C]; by default those of the
             plan.
     """
-    from orthocal.measurement.motion.approach import state_common_approach
+    from orthocal.measurement.motion.motion import state_program_approaches
     from orthocal.observation.conditions import needed_conditions, schedule_readings
 
     needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
     stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
     if temperatures is not None or (needed and not stated):
         plan = schedule_readings(plan, temperatures=temperatures)
-    return state_common_approach(plan)
+    return state_program_approaches(plan)

@@ -297,8 +297,7 @@ def _rod_twists(keys: AdjustmentKeys, robot: Robot) -> dict[Placement, Array]:
     for key in ("moves", "at_mm", "direction", "pivot_mm"):
         if getattr(keys, key) is not None:
             raise RobotError("found with 'lengthens', which excludes it", where=key)
-    legs = robot.legs.values()
-    rods = {f"{leg.name}.{rod.name}": rod for leg in legs for rod in leg.rods.values()}
+    rods = {f"{leg}.{name}": rod for (leg, name), rod in robot.rods.items()}
     if keys.lengthens not in rods:
         expected = f"one of {', '.join(rods)}" if rods else "a robot with rods"
         raise RobotError(f"found '{keys.lengthens}'; expected {expected}", where="lengthens")

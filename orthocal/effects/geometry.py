@@ -21,7 +21,7 @@ import pinocchio as pin
 from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols
 from orthocal.io.documents import PositiveNumber
 from orthocal.robot.closing import RANK_TOLERANCE
-from orthocal.robot.frames import carriers
+from orthocal.robot.frames import carriers, frame_jacobian
 from orthocal.robot.model import Closure, Robot, joint_axis
 from orthocal.robot.parameters import AXES, ElementaryError
 from orthocal.units import MM, MRAD, read_limit
@@ -134,9 +134,7 @@ def _turns(robot: Robot, closure: Closure) -> bool:
     pin.computeJointJacobians(model, data, robot.configuration(coordinates))
     pin.updateFramePlacements(model, data)
     first, second = (
-        pin.getFrameJacobian(
-            model, data, robot.frame_id(frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        )[3:]
+        frame_jacobian(model, data, robot.frame_id(frame))[3:]
         for frame in (closure.frame_a, closure.frame_b)
     )
     _, g = robot.evaluate_constraints_at(coordinates)

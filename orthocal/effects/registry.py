@@ -26,7 +26,7 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     if not issubclass(offered, Effect) or offered.name != name:
         raise TypeError(f"{offered.__qualname__} is not an Effect with name = '{name}'")
     if unknown := [c for c in offered.conditions if c not in get_args(Condition)]:
-        expected = ", ".join(get_args(Condition))
+        expected = f"expected one of {', '.join(get_args(Condition))}"
         raise TypeError(f"{offered.__qualname__}.conditions: found {unknown[0]!r}; {expected}")
     return offered
 
@@ -55,7 +55,7 @@ def register_effect(effect: type[Effect]) -> None:
 
 
 def unregister_effect(name: str) -> None:
-    """Remove a registered effect."""
+    """Remove a registered effect; a built-in effect that it replaced returns."""
     _EFFECTS.unregister(name)
 
 

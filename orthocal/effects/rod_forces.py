@@ -21,7 +21,7 @@ from orthocal.arrays import Array
 from orthocal.effects.protocol import Placement
 from orthocal.effects.rods import stretch_rod
 from orthocal.robot.closing import invert_closures
-from orthocal.robot.frames import carriers
+from orthocal.robot.frames import carriers, frame_jacobian
 from orthocal.robot.model import Robot, require_tcp
 
 
@@ -97,8 +97,7 @@ class RodForces:
         robot, model = self.robot, self.robot.model
         _, by_joints = robot.evaluate_constraints_at(coordinates, data=data)
         pin.updateFramePlacements(model, data)
-        world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        by_tool = pin.getFrameJacobian(model, data, self._tool, world)[:3]
+        by_tool = frame_jacobian(model, data, self._tool)[:3]
         axes = np.array([data.oMf[frame].rotation for frame in self._axes]).reshape(-1, 3, 3)
         placements = [self._rotation(placement, data) for placement in self._index]
         return by_joints, by_tool, axes, np.array(placements).reshape(-1, 3, 3)

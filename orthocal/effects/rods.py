@@ -76,6 +76,5 @@ def _body_of(robot: Robot, rod: Rod, fractions: Sequence[float]) -> int:
 
 def _used_frames(robot: Robot) -> set[int]:
     """Frames of closures, legs, rods and the tool, with the frames that carry them."""
-    rods = (rod for leg in robot.legs.values() for rod in leg.rods.values())
-    names = {*robot.frames, *(f for rod in rods for f in (rod.root, rod.tip))}
+    names = {*robot.frames, *(f for rod in robot.rods.values() for f in (rod.root, rod.tip))}
     return {f for name in names for f in carriers(robot.model, robot.frame_id(name))}

@@ -24,6 +24,7 @@ from pydantic import Field
 from orthocal.effects.protocol import Condition, Effect, EffectKeys, Symbols
 from orthocal.errors import RobotError
 from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot, joint_axis
 from orthocal.robot.parameters import ElementaryError
 from orthocal.units import MM, PPM, read_limit
@@ -35,7 +36,7 @@ PARALLEL = 1e-6
 class ThermalKeys(EffectKeys):
     """Keys under `orthocal.effects.thermal`; the defaults are for steel."""
 
-    reference_C: Annotated[Number, Field(ge=-50.0, le=100.0)] = 20.0
+    reference_C: Annotated[Number, Field(ge=LOWEST_C, le=HIGHEST_C)] = 20.0
     """Temperature of the nominal dimensions."""
     legs_ppm: Annotated[Number, Field(ge=-10.0, le=100.0)] = 11.5
     """Coefficient of expansion of the rods, per kelvin."""

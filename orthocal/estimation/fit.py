@@ -22,14 +22,13 @@ from orthocal.estimation.weighting import (
     NoiseEstimate,
     Scatter,
     first_sigma,
-    initial_sigma,
     initial_sigmas,
     leverages,
     split_by_gauge,
     with_initial_noise,
     with_repeatability,
 )
-from orthocal.observation.gauge_noise import SMALLEST_SIGMA
+from orthocal.observation.gauge_noise import SMALLEST_SIGMA, assumed_sigma
 from orthocal.statistics.chance import COVERAGE, coverage_factor
 from orthocal.statistics.information import (
     Information,
@@ -101,10 +100,10 @@ class Fit:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a reading of the first gauge, [m]; the initial one if unknown."""
+        """Standard deviation of a reading of the first gauge, [m]; the assumed one if unknown."""
         if math.isfinite(self.noise.sigma):
             return floored_sigma(self.noise)
-        return initial_sigma(self.groups[0].gauge, (math.nan, 0))
+        return assumed_sigma(self.groups[0].gauge)
 
     @property
     def loss(self) -> Loss:
@@ -336,6 +335,13 @@ def _solve_with_noise(
             mirrored=compared,
         )
         iterations += solution.iterations
+    if not math.isfinite(estimated) and _depends_on_sigma(program):
+        # the last sigma was that of residuals with too few degrees of freedom
+        sigma = float(initial[groups[0].entries][0])
+        solution = program.solve(sigma=sigma, start=solution.theta, start_passive=solution.passive)
+        iterations += solution.iterations
+        at_assumed = _evaluate(program, solution, sigma, groups, initial)
+        evaluation = replace(at_assumed, noises=evaluation.noises)
     if several:  # the noise of each gauge is that of the solution
         noises = evaluation.noises.with_sigmas(groups, sigma * problem.noise_ratio)
         evaluation = replace(evaluation, noises=noises)
@@ -370,13 +376,11 @@ def _solve_first(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evaluation:
-    """Predictions, residuals and noise of a solution; quantities are those of `Fit`."""
+    """Predictions and noise of a solution; quantities are those of `Fit`."""
 
     prediction: Array
     jacobian: Array
     information: Information
-    residual: Array
-    at_bound: Mask
     noises: NoiseEstimate
 
 
@@ -387,15 +391,14 @@ def _evaluate(
     groups: Sequence[GaugeReadings],
     initial: Array,
 ) -> _Evaluation:
-    """Predictions, Jacobian, residuals and noise at a solution."""
+    """Predictions, Jacobian and noise at a solution."""
     problem = program.problem
     at_bound = problem.selection.held_at_bound(solution.at_bound)
     prediction, jacobian = problem.predict_and_jacobian(solution.theta, solution.passive)
     information = decompose(jacobian, problem.observations)
     residual = _residual(program, solution, prediction)
     scatter = _scatter(program, (jacobian, information), residual, sigma, groups, at_bound)
-    noises = scatter.estimate(initial)
-    return _Evaluation(prediction, jacobian, information, residual, at_bound, noises)
+    return _Evaluation(prediction, jacobian, information, scatter.estimate(initial))
 
 
 def floored_sigma(noise: Noise) -> float:
@@ -448,9 +451,10 @@ def _linearised_sigma(
         Sigma of the first solution, and sigma from the linearised residuals. They differ only if
         the initial sigma is used because of few degrees of freedom.
     """
-    problem = program.problem
+    problem, linear = program.problem, (linearisation.jacobian, linearisation.information)
     sigma = initial = first_sigma(problem, groups)
-    small_dof = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
+    at_active = _scatter(program, linear, linearisation.residual, sigma, groups).common()
+    small_dof = at_active.residual_dof < SMALL_DOF
     use_initial = all(g.gauge.sigma is not None for g in groups) and small_dof
     for i in range(MAX_SIGMA_ROUNDS if _depends_on_sigma(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.active_theta) / problem.theta_scale
@@ -458,26 +462,11 @@ def _linearised_sigma(
         if i == 0:
             rejected = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
             use_initial = use_initial and not rejected
-        linear = linearisation.jacobian, linearisation.information
         estimated = floored_sigma(_scatter(program, linear, residual, sigma, groups).common())
         if not math.isfinite(estimated) or _agrees(estimated / sigma):
             break
         sigma = estimated
     return (initial, sigma) if use_initial else (sigma, sigma)
-
-
-def _residual_dof(
-    problem: CalibrationProblem,
-    information: Information,
-    sigma: float,
-    at_bound: Mask | None = None,
-) -> float:
-    """Number of readings minus free zeros and effective parameters."""
-    o, precision = problem.observations, problem.prior_precision
-    used = information.posterior(
-        sigma=sigma, precision=precision, at_bound=at_bound
-    ).effective_parameters
-    return o.size - o.n_free_zeros - used
 
 
 def require_determined(problem: CalibrationProblem, information: Information) -> None:

@@ -14,8 +14,13 @@ from orthocal.errors import ParameterError
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
-from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, require_prior_std
-from orthocal.text import composed
+from orthocal.robot.parameters import (
+    Parameter,
+    ParameterSet,
+    errors_at,
+    require_prior_std,
+    split_assignment,
+)
 from orthocal.units import Unit, show_limit
 
 KnownWithStd = float | tuple[float, float]
@@ -245,7 +250,7 @@ def read_known(
     result: dict[str, KnownWithTolerance] = {}
     names: set[str] = set()
     for text in texts:
-        key, quantity = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
+        key, quantity = split_assignment(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
         value, sign, tolerance = quantity.replace("+/-", "±").replace("+-", "±").partition("±")
         number = _number(value, where, key)
         with errors_at(where):
@@ -267,7 +272,7 @@ def read_tolerances(
     """
     result = {}
     for text in texts:
-        key, number = _split(text, "NAME=VALUE", where)
+        key, number = split_assignment(text, "NAME=VALUE", where)
         with errors_at(where):
             parameters.read_glob(key)
         result[key] = _number(number, where, key)
@@ -287,7 +292,7 @@ def read_bounds(
     form = "NAME=LOWEST:HIGHEST"
     result = {}
     for text in texts:
-        key, numbers = _split(text, form, where)
+        key, numbers = split_assignment(text, form, where)
         low, colon, high = numbers.partition(":")
         if not colon:
             raise ParameterError(f"found '{text}'; expected {form}", where=where)
@@ -300,14 +305,6 @@ def read_bounds(
             _number(high, where, key) if high.strip() else math.inf,
         )
     return result
-
-
-def _split(text: str, form: str, where: str) -> tuple[str, str]:
-    """Key and value of a text such as KEY=VALUE."""
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise ParameterError(f"found '{text}'; expected {form}", where=where)
-    return composed(key.strip()), value
 
 
 def _number(text: str, where: str, name: str) -> float:

@@ -232,12 +232,14 @@ class Scatter:
         for g in groups:
             sigmas[g.entries] = g.gauge.sigma or 0.0
             resolutions[g.entries] = g.gauge.resolution or 0.0
+        # the rounding of one of several gauges is no limit for another without a stated noise
+        has_floor = stated or len(groups) == 1
         return estimate_noise(
             repeatability=(scatter, cycles_dof),
             residual_square=square,
             residual_dof=dof,
             gauge_sigma=_root_mean_square(sigmas[chosen] / unit) if stated else None,
-            resolution=_root_mean_square(resolutions[chosen] / unit),
+            resolution=_root_mean_square(resolutions[chosen] / unit) if has_floor else None,
         )
 
 

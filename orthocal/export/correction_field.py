@@ -125,7 +125,8 @@ class CorrectionField:
             self._rotation, self._translation = self._align(aligned_over)
         self._side = BOX_SIDE * robot.characteristic_length
         self._boxes: dict[Key, _Box | Fallback] = {}
-        self._largest_error = EXACT_ERROR
+        self.error = EXACT_ERROR
+        """Largest estimated error of the polynomials in use, [m]."""
         n = len(self.axes)
         line = chebyshev_line(NODES_PER_AXIS)
         self._nodes = grid_points(line, n)
@@ -140,11 +141,6 @@ class CorrectionField:
         )
         random = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_CHECKS, n))
         self._checks = np.vstack([grid_points(between, n), random])
-
-    @property
-    def error(self) -> float:
-        """Largest estimated error of the polynomials in use, [m]."""
-        return self._largest_error
 
     def __call__(self, points: Array) -> tuple[Array, Mapping[int, str]]:
         """Points to command.
@@ -273,7 +269,7 @@ class CorrectionField:
                 self._boxes.pop(next(iter(self._boxes)))
             box = self._boxes[key] = self._make(key)
             if isinstance(box, _Box):
-                self._largest_error = max(self._largest_error, box.error)
+                self.error = max(self.error, box.error)
         return self._boxes[key]
 
     def _make(self, key: Key) -> _Box | Fallback:

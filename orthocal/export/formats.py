@@ -91,6 +91,9 @@ EXPORTERS |= {name: partial(export_printer, firmware=name) for name in FIRMWARES
 
 FORMATS = (*EXPORTERS, "linuxcnc")
 
+OF_OFFSETS = ("table", "linuxcnc")
+"""Formats for a controller with offsets of the drives."""
+
 
 def export_calibration(
     calibration: Calibration,
@@ -112,12 +115,15 @@ def export_calibration(
         Texts of files by file name.
 
     Raises:
-        ParameterError: If the format is unknown or does not have an option.
+        ParameterError: If the format is unknown, does not have an option, or does not apply to the
+            firmware of a printer.
         ExportError: If the verdict is review or reject, or the machine does not reach the region of
             the format.
     """
     if to not in FORMATS:
         raise ParameterError(f"found '{to}'; expected one of {', '.join(FORMATS)}", where="--to")
+    if to in OF_OFFSETS:
+        require_offsets(calibration, where="--to")
     if not anyway:
         require_entering(calibration)
     options = options or ExportOptions()
@@ -132,6 +138,26 @@ def export_calibration(
     if to == "linuxcnc":
         files = _add_warning(files, note_wrong_order(calibration))
     return _add_warning(files, warn_against_verdict(calibration))
+
+
+def require_offsets(calibration: Calibration, *, where: str) -> None:
+    """Refuse a printer, whose firmware has settings instead of offsets.
+
+    Args:
+        calibration: The calibration.
+        where: Option or file that requires offsets, for the message.
+
+    Raises:
+        ParameterError: If the session states the settings of a firmware.
+    """
+    firmware = calibration.session.firmware
+    if firmware is not None:
+        raise ParameterError(
+            "the calibration is that of a printer, whose firmware has settings instead of offsets: "
+            f"`orthocal export --to {firmware.firmware}` writes them. After they are entered, "
+            "probe again, and `orthocal import` the new log",
+            where=where,
+        )
 
 
 def require_entering(calibration: Calibration) -> None:

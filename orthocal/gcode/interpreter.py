@@ -385,9 +385,7 @@ class Interpreter:
         code, modes = _tenfold(word.value), self.modes
         match GROUPS[code]:
             case "motion":
-                motion = None if code == 800.0 else int(word.value)
-                if motion != modes.motion:
-                    self.modes = replace(modes, motion=motion)
+                self.modes = replace(modes, motion=None if code == 800.0 else int(word.value))
             case "plane":
                 self.modes = replace(modes, plane=int(word.value))
             case "unit":
@@ -482,13 +480,8 @@ class Interpreter:
 
     def _is_unknown_after(self, words: Mapping[str, float]) -> bool:
         """True for a rapid motion at the start that leaves the position of an axis unknown."""
-        return (
-            (self.modes.motion, self.modes.absolute, self._moved) == (0, True, False)
-            and not _COORDINATES.isdisjoint(words)
-            and any(
-                self.position[k] is None and letter not in words
-                for k, letter in self._letters.items()
-            )
+        return (self.modes.motion, self.modes.absolute, self._moved) == (0, True, False) and any(
+            self.position[k] is None and letter not in words for k, letter in self._letters.items()
         )
 
     def _pass(self, line: Line, words: Mapping[str, float], where: str) -> Step:

@@ -70,10 +70,8 @@ class Parts:
     """Sides of the drives on each part, shape (k, n_drives)."""
     reversed: Mask
     """True if a side differs from that of the previous part, shape (k,)."""
-    starts: list[int]
-    """First part of each motion."""
-    ends: list[int]
-    """Part after the last part of each motion."""
+    bounds: list[int]
+    """First part of each motion, and the number of all parts."""
 
 
 def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
@@ -104,8 +102,7 @@ def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
         _part_ends(motion, first),
         filled[1:][is_start],
         reverses[is_start],
-        [0, *ends[:-1]],
-        ends,
+        [0, *ends],
     )
 
 

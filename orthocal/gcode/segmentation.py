@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -56,6 +57,10 @@ class Correction(Protocol):
         """
 
 
+MotionCorrection = Callable[[Array, Indices], tuple[Array, Mapping[int, str]]]
+"""Correction of points, with the motion of each point."""
+
+
 class Segments(NamedTuple):
     """Polyline of a motion."""
 
@@ -93,13 +98,18 @@ def segment_motions(
             an additional segment takes up its backlash there.
     """
     if sides is None or not len(paths.base):
-        return _segment(paths, correct, tolerance)
+        return _segment(paths, lambda points, _: correct(points), tolerance)
     reversals = split_at_reversals(paths, sides)
     parts = paths.parts(reversals.motion, reversals.first, reversals.last)
-    segments = _segment(parts, correct, tolerance, sides=sides, part_sides=reversals.sides)
+
+    def correct_on_sides(points: Array, part: Indices) -> tuple[Array, Mapping[int, str]]:
+        corrected, refused = correct(points)
+        return sides.command(corrected, reversals.sides[part]), refused
+
+    segments = _segment(parts, correct_on_sides, tolerance)
     return [
         _join([segments[k] for k in range(*ends)], reversals.reversed[slice(*ends)])
-        for ends in zip(reversals.starts, reversals.ends, strict=True)
+        for ends in pairwise(reversals.bounds)
     ]
 
 
@@ -125,30 +135,14 @@ def _join(parts: list[Segments | Refused], reversed_drives: Mask) -> Segments | 
     )
 
 
-def _segment(
-    paths: Paths,
-    correct: Correction,
-    tolerance: float,
-    *,
-    sides: Sides | None = None,
-    part_sides: Array | None = None,
-) -> list[Segments | Refused]:
+def _segment(paths: Paths, correct: MotionCorrection, tolerance: float) -> list[Segments | Refused]:
     """Segments of each motion.
 
     Args:
         paths: Curves of the motions.
         correct: Correction of points.
         tolerance: Largest distance of the corrected motion from its chords, [m].
-        sides: Sides of drives with backlash.
-        part_sides: Sides of the drives on each motion, shape (n, n_drives).
     """
-
-    def correct_on_sides(points: Array, motion: Indices) -> tuple[Array, Mapping[int, str]]:
-        corrected, refused = correct(points)
-        if sides is None or part_sides is None:
-            return corrected, refused
-        return sides.command(corrected, part_sides[motion]), refused
-
     lengths, radii = paths.lengths, paths.largest_radii
     # sagitta of an arc: s²/8r
     longest = np.where(radii > 0.0, np.sqrt(8.0 * radii * EVALUATED_SHARE * tolerance), np.inf)
@@ -165,7 +159,7 @@ def _segment(
             )
         refined: list[int] = []
         for group in _groups(pending[counts[pending] <= MOST_SEGMENTS], counts):
-            repeated = _segment_group(paths, group, counts, correct_on_sides, tolerance, results)
+            repeated = _segment_group(paths, group, counts, correct, tolerance, results)
             for i, count in repeated:
                 counts[i] = count
                 refined.append(i)
@@ -188,7 +182,7 @@ def _segment_group(
     paths: Paths,
     group: Indices,
     counts: Array,
-    correct: Callable[[Array, Indices], tuple[Array, Mapping[int, str]]],
+    correct: MotionCorrection,
     tolerance: float,
     results: list[Segments | Refused | None],
 ) -> Iterator[tuple[int, float]]:
@@ -198,7 +192,7 @@ def _segment_group(
         paths: Curves of the motions.
         group: Indices of the motions to divide.
         counts: Number of segments of each motion.
-        correct: Correction of points, with the motion of each point.
+        correct: Correction of points.
         tolerance: Largest distance of the corrected motion from its chords, [m].
         results: Result of each motion; filled by this function.
 

@@ -412,11 +412,12 @@ def _temporary_name() -> str:
 
 
 def _clean_up(folder: Path) -> None:
-    """Remove the temporary files of killed processes from a directory."""
+    """Remove the temporary files of killed processes from a directory, if they may be removed."""
     for entry in os.scandir(folder):
         temporary = _LEFTOVER.fullmatch(entry.name)
         if temporary and not _is_alive(int(temporary[1])):
-            Path(entry.path).unlink(missing_ok=True)
+            with suppress(OSError):  # of another user, in a shared directory
+                os.unlink(entry.path)
 
 
 def _is_alive(process: int) -> bool:

@@ -10,7 +10,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,17 +60,20 @@ class Journal:
             raise OutputError(f"cannot be written: {e.strerror}", where=str(self.path)) from None
 
     def append(self, entry: Mapping[str, Any]) -> None:
-        """Append a line and sync it to disk.
+        """Append a line and sync it to disk; nothing is appended if it cannot be written.
 
         Raises:
             OutputError: If the line cannot be written.
         """
         data = (json.dumps(entry, allow_nan=False) + "\n").encode()
+        end = os.fstat(self._descriptor).st_size
         try:
             while data:
                 data = data[os.write(self._descriptor, data) :]
             os.fsync(self._descriptor)
         except OSError as e:
+            with suppress(OSError):  # the next line would continue an incomplete one
+                os.ftruncate(self._descriptor, end)
             raise OutputError(f"cannot be written: {e.strerror}", where=str(self.path)) from None
 
 

@@ -6,6 +6,7 @@ the memory or the stack.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
@@ -35,6 +36,9 @@ _TAGS: dict[type[yaml.Event], frozenset[str]] = {
 }
 """Allowed explicit tags by kind of value."""
 
+_OTHER_NOTATION = re.compile(r"[-+]?(?:0[0-9_]+|0[xb].*|[0-9]+[:_].*)")
+"""Numbers of YAML that are read otherwise than they look: 060 is 48, and 1:30 is 90."""
+
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -43,13 +47,18 @@ class _Loader(_Base):  # type: ignore[misc] # either of PyYAML's safe loaders
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401 - any value
         """Value of a node."""
+        is_number = node.tag in (f"{_YAML}int", f"{_YAML}float")
         try:
-            if node.tag in (f"{_YAML}int", f"{_YAML}float") and len(node.value) > LONGEST_NUMBER:
+            if is_number and len(node.value) > LONGEST_NUMBER:
                 raise ValueError
             value = super().construct_object(node, deep)
         except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
             tag = str(node.tag).replace(_YAML, "!!")
             raise _error(f"'{shorten(str(node.value))}' does not fit its tag {tag}", node) from None
+        if is_number and _OTHER_NOTATION.fullmatch(node.value):
+            expected = "expected a decimal number without leading zeros, or a text in quotes"
+            hint = " (a decimal comma? write a point)" if node.value.isdigit() else ""
+            raise _error(f"found {shorten(node.value)}; {expected}{hint}", node)
         if problem := text_problem(value):
             raise _error(problem, node)
         return value

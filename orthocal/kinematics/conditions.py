@@ -248,9 +248,3 @@ def require_range(value: float, low: float, high: float, unit: str, *, where: st
         raise ParameterError(
             f"found {value:g}; expected {unit} from {low:g} to {high:g}", where=where
         )
-
-
-def tool_force(robot: Robot, payload: float) -> Array:
-    """Sum of the forces of all effects on the tool centre point, shape (3,), [N]."""
-    forces = [effect.tool_force(payload) for effect in robot_effects(robot)]
-    return np.asarray(np.sum(forces, axis=0))

@@ -17,11 +17,13 @@ from orthocal.errors import ClosureError
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.robot.closing import CLOSURE_TOLERANCE, RANK_TOLERANCE, describe_opening
 from orthocal.robot.model import (
+    LIMIT_TOLERANCE,
     Robot,
     closure_row_units,
     closure_turns,
     coordinate_limits,
     coordinate_names,
+    coordinate_turns,
     coordinate_units,
 )
 from orthocal.units import DRIVE_UNITS
@@ -60,9 +62,6 @@ SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
 LARGEST_CONTINUATION_MOVE = 0.3
 """Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
 
-LIMIT_TOLERANCE = 1e-9
-"""Accepted excess over the limit of a joint, [m or rad]."""
-
 MAX_POINTS = 4096
 """Postures per block of a batch of machines, which limits the memory of their Jacobians."""
 
@@ -84,6 +83,7 @@ class System:
         shortest: Use the shortest steps that close the loops, for robots with free motions. Their
             Jacobians are singular up to rounding, so that solving them does not give a useful step.
         units: Metres per unit of x, shape (n_x,).
+        turning: Mask of the x that are rotations, shape (n_x,).
         row_units: Metres per unit of each row, shape (n_rows,).
         lower: Lower bounds of x, shape (n_x,).
         upper: Upper bounds of x, shape (n_x,).
@@ -106,7 +106,8 @@ class System:
         self.n_x = index.size
         self.shortest = robot.closure_rows + n_tool != index.size
         self.units = coordinate_units(robot)[index]
-        self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot))
+        self.turning = coordinate_turns(robot.model)[index]
+        self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot.model))
         names = coordinate_names(robot.model)
         self.names = tuple(names[k] for k in index.tolist())
         self.row_units = np.append(closure_row_units(robot), np.ones(n_tool))
@@ -163,7 +164,7 @@ class System:
         drives = {d.name: d for d in self.robot.drives}
         if self.names[j] in drives:
             return drives[self.names[j]].describe_beyond(value)
-        unit, size = DRIVE_UNITS["m" if self.units[j] == 1.0 else "rad"]
+        unit, size = DRIVE_UNITS["rad" if self.turning[j] else "m"]
         low, high = self.lower[j] / size, self.upper[j] / size
         return f"at {value / size:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
 
@@ -272,7 +273,7 @@ class _Path:
         self._allow_singular = allow_singular
         length = system.robot.characteristic_length
         self._tolerance = CLOSURE_TOLERANCE * max(1.0, length)
-        self._max_moves = LARGEST_CONTINUATION_MOVE * np.where(system.units == 1.0, length, 1.0)
+        self._max_moves = LARGEST_CONTINUATION_MOVE * np.where(system.turning, 1.0, length)
         self._refused = np.zeros(len(points), dtype=np.bool_)
 
     def _refuse(self, i: int, reason: str, residual: float | None = None) -> None:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import casadi as ca
-import numpy as np
 
 from orthocal.effects.loading import robot_effects
 from orthocal.robot.model import Robot
@@ -139,12 +138,7 @@ def fingerprint(robot: Robot) -> str:
         repr(robot.closures),
         repr(robot.drives),
         repr(robot.tcp),
-        repr(
-            [
-                (leg.name, leg.root, leg.tip, leg.root_driven, np.asarray(leg.axis).tolist())
-                for leg in robot.legs.values()
-            ]
-        ),
+        repr(robot.legs),
         repr([d.hex() for d in robot.reference_posture.tolist()]),
         repr(robot.drive_index.tolist()),
         repr(robot.passive_index.tolist()),
@@ -154,7 +148,7 @@ def fingerprint(robot: Robot) -> str:
         repr(robot.declared.adjustments) if robot.adjusted else "",
         *(source_digest(type(e)) for e in robot_effects(robot)),  # type: ignore[arg-type] # hashable
         repr([(p.name, p.terms) for p in robot.parameters]),
-        float(robot.characteristic_length).hex(),
+        repr(robot.declared.models),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
 from orthocal.arrays import Array
+from orthocal.effects.loading import robot_effects
 from orthocal.effects.rod_forces import RodForces
 from orthocal.errors import ClosureError
-from orthocal.kinematics.conditions import UseConditions, tool_force
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.continuation import (
     Failures,
     System,
@@ -538,8 +539,10 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
         reach.
     """
     masses, mass_of = np.unique(np.broadcast_to(payload, len(drives)), return_inverse=True)
-    forces = np.array([tool_force(robot, float(m)) for m in masses]).reshape(-1, 3)[mass_of]
-    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), forces))
+    effects = robot_effects(robot)
+    forces = np.array([[e.tool_force(float(m)) for e in effects] for m in masses])
+    on_tool = forces.reshape(-1, len(effects), 3).sum(axis=1)[mass_of]
+    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), on_tool))
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> Failures:
@@ -552,11 +555,11 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
     """
     failures, labels = Failures(), label_postures(names, len(drives))
     for drive, values in zip(robot.drives, drives.T, strict=True):
-        factor, unit = drive.edge_factor, drive.edge_unit
+        size = drive.joint_size
         for i in np.flatnonzero(drive.is_beyond(values)).tolist():
             reason = (
-                f"{drive.name}_{unit} is {values[i] * factor:g}; the drive reaches from "
-                f"{drive.lower * factor:g} to {drive.upper * factor:g}"
+                f"{drive.name}_{drive.joint_unit} is {values[i] / size:g}; the drive reaches from "
+                f"{drive.lower / size:g} to {drive.upper / size:g}"
             )
             failures.setdefault(i, ClosureError(reason, posture=labels[i]))
     return dict(sorted(failures.items()))

@@ -23,7 +23,7 @@ from orthocal.kinematics.workspace import (
     describe_box,
     tool_at_zero,
 )
-from orthocal.robot.model import Robot, require_commanded_tool
+from orthocal.robot.model import Robot, coordinate_units, require_commanded_tool
 
 RequireReach = Callable[[Array], object]
 """Check of tool positions, shape (K, n_coordinates), [m]: raises ClosureError if one is out of
@@ -36,7 +36,8 @@ REACH_MARGIN = 1.08
 """Factor by which the nominal machine must reach further than the default cube."""
 
 MAX_CONDITION_NUMBER = 10.0
-"""Largest condition number in a workspace of the tool Jacobian with respect to the drives."""
+"""Largest condition number in a workspace of the tool Jacobian with respect to the drives, whose
+rotations are scaled to metres."""
 
 BISECTION_TOLERANCE = 0.004
 """Relative accuracy of the bisection for the largest box."""
@@ -118,14 +119,19 @@ def _nominal_reach_check(robot: Robot) -> RequireReach:
     Positions must be within the travel of the drives and away from singularities.
     """
     coordinates = list(require_commanded_tool(robot))
+    units = coordinate_units(robot)[robot.drive_index]
     sensitivity = ToolSensitivity(robot, free=[f"{d.name}.offset" for d in robot.drives])
 
     def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         require_travel(robot, drives)
-        jacobians = sensitivity(drives, passive=passive)[:, coordinates]
+        singular = ClosureError("is nearly singular", posture="a corner")
+        try:
+            jacobians = sensitivity(drives, passive=passive)[:, coordinates] / units
+        except np.linalg.LinAlgError:  # of the closures: the drives leave motions free
+            raise singular from None
         if (np.linalg.cond(jacobians) > MAX_CONDITION_NUMBER).any():
-            raise ClosureError("is nearly singular", posture="a corner")
+            raise singular
 
     return require_reach
 

@@ -30,7 +30,7 @@ from orthocal.kinematics.symbolic import (
     nominal_placement,
 )
 from orthocal.robot.frames import Placement, carriers
-from orthocal.robot.model import Closure, Robot, joint_axis
+from orthocal.robot.model import Closure, Robot, joint_axis, require_tcp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,8 +130,8 @@ class RobotFunctions:
         ends = {robot.frame_id(name) for c in robot.closures for name in (c.frame_a, c.frame_b)}
         tool = () if robot.tcp is None else (robot.frame_id(robot.tcp.frame),)
         parts: list[object] = [
-            [(j.shortname(), j.idx_v, j.nv) for j in model.joints],
-            [joint_axis(model, i).tolist() for i in joints if model.joints[i].nv == 1],
+            [(j.shortname(), j.idx_v) for j in model.joints],
+            [joint_axis(model, i).tolist() for i in joints],
             list(model.parents),
             [(f.name, f.parentJoint, f.parentFrame) for f in model.frames],
             self._fixed([p for i in joints if (p := Placement(i, False)) not in moved]),
@@ -149,8 +149,8 @@ class RobotFunctions:
 
     def fixed_passive(self, frames: Sequence[int]) -> str:
         """Reference values of the passive coordinates that move some frames, in words."""
-        joints = (self.robot.model.joints[j] for f in frames for j in self.tree.joints_to(f))
-        moving = {k for joint in joints for k in range(joint.idx_v, joint.idx_v + joint.nv)}
+        joints = self.robot.model.joints
+        moving = {joints[j].idx_v for f in frames for j in self.tree.joints_to(f)}
         coordinates = zip(self.robot.passive_index, self.robot.reference_passive, strict=True)
         return repr([(int(k), float(value)) for k, value in coordinates if k in moving])
 
@@ -263,7 +263,7 @@ class RobotFunctions:
 
     def _tool(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Position p of the tool, ∂p/∂q and ∂p/∂ξ."""
-        frame = self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
+        frame = self.robot.frame_id(require_tcp(self.robot).frame)
         return self.tree.frame_pose(frame).position, *self.wrench_rows(frame, ca.SX.eye(3))
 
     def wrench_rows(
@@ -343,12 +343,8 @@ class RobotFunctions:
             twists[:, source.first : source.first + 6] += block
         if source.joint is not None:
             model = self.robot.model
-            joint = model.joints[source.joint]
-            if joint.nv == 1:
-                axis = ca.sparsify(ca.SX(joint_axis(model, source.joint)))
-            else:
-                axis = ca.vertcat(ca.SX.eye(3), ca.SX(3, 3))  # a translation joint
-            joints[:, joint.idx_v : joint.idx_v + joint.nv] += block @ axis
+            axis = ca.sparsify(ca.SX(joint_axis(model, source.joint)))
+            joints[:, model.joints[source.joint].idx_v] += block @ axis
 
     def split(self, by_joints: ca.SX) -> list[ca.SX]:
         """Split a derivative, shape (n, nv), into its actuated and its passive columns."""

@@ -1,4 +1,6 @@
-"""Exponential and logarithm of SE(3) and their Jacobians, for NumPy arrays and CasADi expressions.
+"""Exponential of SE(3) and its Jacobian, for NumPy arrays and CasADi expressions.
+
+The logarithm and its Jacobian are for expressions only.
 
 A twist is (translation v, rotation ω), as in Pinocchio. All coefficients belong to one family,
 
@@ -48,11 +50,8 @@ class _Operations(NamedTuple):
     sqrt: Callable[[Any], Any]
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]
-    arctan2: Callable[[Any, Any], Any]
     skew: Callable[[Any], Any]
-    inverse_skew: Callable[[Any], Any]
     transpose: Callable[[Any], Any]
-    trace: Callable[[Any], Any]
 
 
 @overload
@@ -81,41 +80,32 @@ def exp6(twist: Operand) -> tuple[Operand, Operand]:
     return (rotation, position) if m is _CASADI else (rotation, position[..., 0])
 
 
-@overload
-def log6(rotation: Array, position: Array) -> Array: ...
-@overload
-def log6(rotation: ca.SX, position: ca.SX) -> ca.SX: ...
-def log6(rotation: Operand, position: Operand) -> Operand:
+def log6(rotation: ca.SX, position: ca.SX) -> ca.SX:
     """Logarithm of a pose, for rotation angles below π.
 
         ω = (θ/sin θ) ½ vee(R − Rᵀ)
         v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
 
     Args:
-        rotation: Shape (..., 3, 3).
-        position: Shape (..., 3), [m].
+        rotation: Shape (3, 3).
+        position: Shape (3,), [m].
 
     Returns:
-        Twist, shape (..., 6), [m, rad].
+        Twist, shape (6,), [m, rad].
     """
-    m = _CASADI if isinstance(rotation, ca.SX) else _NUMPY
-    p = position if m is _CASADI else np.asarray(position)[..., None]
-    half = 0.5 * m.inverse_skew(rotation - m.transpose(rotation))
-    cosine = 0.5 * (m.trace(rotation) - 1.0)
-    sine2 = m.transpose(half) @ half
+    half = 0.5 * ca.inv_skew(rotation - rotation.T)
+    cosine = 0.5 * (ca.trace(rotation) - 1.0)
+    sine2 = half.T @ half
     near = cosine > LOGARITHM_SERIES_ABOVE
-    sine = m.sqrt(m.where(near, 1.0, sine2))
-    safe_cosine = m.where(near, 0.0, cosine)
-    angle = m.arctan2(sine, safe_cosine)
-    w = m.where(near, _polynomial(sine2, _ARCSINE), angle / sine) * half
+    sine = ca.sqrt(ca.if_else(near, 1.0, sine2))
+    safe_cosine = ca.if_else(near, 0.0, cosine)
+    angle = ca.atan2(sine, safe_cosine)
+    w = ca.if_else(near, _polynomial(sine2, _ARCSINE), angle / sine) * half
     far = 1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * sine)
-    beta = m.where(near, _polynomial(m.transpose(w) @ w, _BERNOULLI), far)
-    hat = m.skew(w)
-    cross = hat @ p
-    v = p - 0.5 * cross + beta * (hat @ cross)
-    if m is _CASADI:
-        return ca.vertcat(v, w)
-    return np.concatenate([v, w], axis=-2)[..., 0]
+    beta = ca.if_else(near, _polynomial(w.T @ w, _BERNOULLI), far)
+    hat = ca.skew(w)
+    cross = hat @ position
+    return ca.vertcat(position - 0.5 * cross + beta * (hat @ cross), w)
 
 
 @overload
@@ -212,31 +202,19 @@ def _split(twist: Operand) -> tuple[_Operations, Operand, Operand]:
     return _NUMPY, columns[..., :3, :], columns[..., 3:, :]
 
 
-def _inverse_skew(matrices: Array) -> Array:
-    """Vectors v of cross-product matrices [v], as columns, shape (..., 3, 1)."""
-    parts = [matrices[..., 2, 1], matrices[..., 0, 2], matrices[..., 1, 0]]
-    return np.stack(parts, axis=-1)[..., None]
-
-
 _NUMPY = _Operations(
     where=np.where,
     sqrt=np.sqrt,
     sin=np.sin,
     cos=np.cos,
-    arctan2=np.arctan2,
     skew=lambda column: skew(column[..., 0]),
-    inverse_skew=_inverse_skew,
     transpose=lambda a: np.swapaxes(a, -1, -2),
-    trace=lambda a: np.trace(a, axis1=-2, axis2=-1)[..., None, None],
 )
 _CASADI = _Operations(
     where=ca.if_else,
     sqrt=ca.sqrt,
     sin=ca.sin,
     cos=ca.cos,
-    arctan2=ca.atan2,
     skew=ca.skew,
-    inverse_skew=ca.inv_skew,
     transpose=lambda a: a.T,
-    trace=ca.trace,
 )

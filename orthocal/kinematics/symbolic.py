@@ -18,7 +18,6 @@ import pinocchio as pin
 from orthocal.arrays import Array
 from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import Condition, Placement
-from orthocal.errors import RobotError
 from orthocal.kinematics.se3 import exp6, log6
 from orthocal.robot.frames import nearest_carrier
 from orthocal.robot.model import Robot, joint_axis
@@ -51,43 +50,17 @@ def constant_pose(placement: pin.SE3) -> Pose:
     return Pose(ca.sparsify(ca.SX(rotation)), ca.sparsify(ca.SX(position)))
 
 
-def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
-    """Motion M_i(q) = exp6(S q) of a joint.
-
-    Args:
-        model: The model.
-        joint: Index of the joint.
-        coordinates: Coordinates of the joint, shape (nv,); one angle for an unbounded revolute
-            joint.
-
-    Raises:
-        RobotError: If the joint is not a revolute, prismatic, helical or translation joint.
-    """
-    joint_model = model.joints[joint]
-    if "Translation" in joint_model.shortname():
-        return Pose(ca.SX.eye(3), coordinates)
-    if joint_model.nv != 1:
-        raise RobotError(
-            f"joint '{model.names[joint]}' is a {joint_model.shortname()}; supported are "
-            "revolute (bounded or not), prismatic, helical and translation joints"
-        )
-    return screw_motion(joint_axis(model, joint), coordinates)
-
-
-def screw_motion(axis: Array, angle: ca.SX) -> Pose:
-    """Motion exp6(S q) for a constant axis S = (v, ω), shape (6,), with |ω| = 1 or ω = 0."""
+def joint_motion(axis: Array, coordinate: ca.SX) -> Pose:
+    """Motion exp6(S q) of a revolute or prismatic joint with the axis S = (v, ω), shape (6,)."""
     v, w = np.array(axis[:3]), np.array(axis[3:])
     if not np.any(w):
-        return Pose(ca.SX.eye(3), ca.sparsify(ca.SX(v)) * angle)
+        return Pose(ca.SX.eye(3), ca.sparsify(ca.SX(v)) * coordinate)
     hat = pin.skew(w)
-    s, c = ca.sin(angle), ca.cos(angle)
+    s, c = ca.sin(coordinate), ca.cos(coordinate)
     rotation = (
         ca.SX.eye(3) + s * ca.sparsify(ca.SX(hat)) + (1.0 - c) * ca.sparsify(ca.SX(hat @ hat))
     )
-    if not np.any(v):
-        return Pose(rotation, ca.SX(3, 1))
-    position = angle * v + (1.0 - c) * (hat @ v) + (angle - s) * (hat @ hat @ v)
-    return Pose(rotation, position)
+    return Pose(rotation, ca.SX(3, 1))
 
 
 class SymbolicTree:
@@ -131,8 +104,8 @@ class SymbolicTree:
     def joint_pose(self, joint: int) -> Pose:
         """World pose of a joint's moving frame."""
         if joint not in self._joints:
-            first, count = self.model.joints[joint].idx_v, self.model.joints[joint].nv
-            motion = joint_motion(self.model, joint, self.coordinates[first : first + count])
+            coordinate = self.coordinates[self.model.joints[joint].idx_v]
+            motion = joint_motion(joint_axis(self.model, joint), coordinate)
             self._joints[joint] = self.joint_base(joint) * motion
         return self._joints[joint]
 

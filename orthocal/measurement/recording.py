@@ -25,7 +25,12 @@ from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of
+from orthocal.measurement.files.point_rows import (
+    find_point,
+    locate_stations,
+    point_of,
+    value_name,
+)
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.files.session_edits import add_alignment, add_readings
@@ -202,6 +207,7 @@ class Recording:
                 self.session.gauges[setup.gauge],
                 difference=self.session.is_difference(row),
                 where=row.label_with_cycle,
+                name=value_name(row.setup),
                 largest=largest_reading(setup.sensor),
                 of_setup_mm=[r.value / MM for r in self.rows if r.setup == row.setup and r.is_read],
             )

@@ -24,15 +24,16 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
     """Contacts of all sensors with the nominal machine in the postures of their readings.
 
     Returns:
-        Names of setups, mapped to the names of the postures and the contacts in them.
+        Names of setups with readings, mapped to the names of the postures and the contacts in them.
     """
     place = _nominal_places(session)
     postures = {name: i for i, name in enumerate(session.postures)}
-    read: dict[str, set[str]] = {name: set() for name in session.setups}  # postures by setup
+    read: dict[str, set[str]] = {}  # postures by setup
     for reading in session.readings:
-        read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
+        names_of_row = (p for p in (reading.posture, reading.minus) if p is not None)
+        read.setdefault(reading.setup, set()).update(names_of_row)
     result = {}
-    for setup in session.setups.values():
+    for setup in (s for s in session.setups.values() if s.name in read):
         names = sorted(read[setup.name], key=postures.__getitem__)
         frames, at_zero = place(setup.sensor.frames(session.robot), [postures[n] for n in names])
         result[setup.name] = names, setup.sensor.contact(frames, at_zero, session.robot)

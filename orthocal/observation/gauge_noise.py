@@ -7,7 +7,10 @@ import math
 from orthocal.session.session import Gauge
 
 DEFAULT_SIGMA = 10e-6
-"""Assumed noise of a gauge that does not state it, [m]."""
+"""Assumed noise of a gauge that does not state it, [m].
+
+Half of the resolution would be too little for gauges that scatter by more than they resolve: with
+0.001 mm and a scatter of 0.03 mm, correct readings would count as mistakes."""
 
 USUAL_STDS = 4.0
 """Largest usual difference of two readings of one posture, in standard deviations of a difference:

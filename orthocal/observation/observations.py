@@ -20,6 +20,7 @@ from orthocal.kinematics.loop_closure import LoopClosure, find_loads
 from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
 from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.robot.model import Robot
+from orthocal.session.differences import Node, connect, find_leader
 from orthocal.session.session import Conditions, Reading, Session
 from orthocal.text import spans
 
@@ -165,26 +166,21 @@ class Observations:
         One entry of each group of differences has the value 0.
         """
         result = np.zeros(self.size)
+        pending = np.flatnonzero(self.minus >= 0)
+        result[self.plus] = np.where(self.minus < 0, rows, 0.0)
+        _, first = np.unique(self.zero[self.plus[pending]], return_index=True)
         done = np.zeros(self.size, dtype=bool)
-        single = self.minus < 0
-        result[self.plus[single]] = rows[single]
-        done[self.plus[single]] = True
-        pending = list(np.flatnonzero(~single))
-        while pending:
-            postponed = []
-            for row in pending:
-                p, m = self.plus[row], self.minus[row]
-                if done[p]:
-                    result[m] = result[p] - rows[row]
-                elif done[m]:
-                    result[p] = result[m] + rows[row]
-                else:
-                    postponed.append(row)
-                    continue
-                done[p] = done[m] = True
-            if len(postponed) == len(pending):  # start a new group
-                done[self.minus[postponed[0]]] = True
-            pending = postponed
+        done[self.minus[pending[first]]] = True
+        while pending.size:  # rows of which one entry has its value
+            forward, backward = done[self.plus[pending]], done[self.minus[pending]]
+            for known, entries, others, sign in (
+                (forward, self.minus, self.plus, -1.0),
+                (backward, self.plus, self.minus, 1.0),
+            ):
+                solved = pending[known]
+                result[entries[solved]] = result[others[solved]] + sign * rows[solved]
+                done[entries[solved]] = True
+            pending = pending[~(forward | backward)]
         return result
 
 
@@ -196,12 +192,16 @@ def build_observations(session: Session) -> Observations:
     pairs: dict[int, int] = {}  # second postures by entry
     conditions: list[Conditions | None] = []
     # key of a gauge: its setup; key of a group of differences: setup, cycle, group
-    zeros: dict[tuple[str] | tuple[str, int, str], int] = {}
-    nodes: dict[tuple[str, int, str], int] = {}
+    zeros: dict[tuple[str] | Node, int] = {}
+    nodes: dict[Node, int] = {}
     plus, minus = [], []
-    groups = _difference_groups(session)
+    # differences that share postures, directly or by others, are a group
+    leaders: dict[Node, Node] = {}
+    for r in session.readings:
+        if r.minus is not None and session.is_difference(r):
+            connect(leaders, (r.setup, r.cycle, r.posture), (r.setup, r.cycle, r.minus))
 
-    def add(reading: Reading, posture: str, zero: tuple[str] | tuple[str, int, str]) -> int:
+    def add(reading: Reading, posture: str, zero: tuple[str] | Node) -> int:
         number = zeros.setdefault(zero, len(zeros))
         entries.append((setups[reading.setup], postures[posture], number))
         conditions.append(reading.conditions if reading.minus is None else None)
@@ -210,7 +210,7 @@ def build_observations(session: Session) -> Observations:
     def find_or_add(reading: Reading, posture: str) -> int:
         node = (reading.setup, reading.cycle, posture)
         if node not in nodes:
-            nodes[node] = add(reading, posture, (reading.setup, reading.cycle, groups[node]))
+            nodes[node] = add(reading, posture, find_leader(leaders, node))
         return nodes[node]
 
     for r in session.readings:
@@ -291,25 +291,6 @@ def _require_common_placements(states: States, session: Session, pairs: bool) ->
         )
 
 
-def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
-    """Setup, cycle and posture of differences, mapped to the name of their group.
-
-    Differences that share postures, directly or by others, are a group (union-find).
-    """
-    parents: dict[tuple[str, int, str], tuple[str, int, str]] = {}
-
-    def root(node: tuple[str, int, str]) -> tuple[str, int, str]:
-        while (parent := parents.setdefault(node, node)) != node:
-            parents[node] = parents.setdefault(parent, parent)  # halves the path
-            node = parent
-        return node
-
-    for r in session.readings:
-        if r.minus is not None and session.is_difference(r):
-            parents[root((r.setup, r.cycle, r.posture))] = root((r.setup, r.cycle, r.minus))
-    return {node: root(node)[2] for node in list(parents)}
-
-
 def _all_conditions(
     session: Session, stated: Sequence[Conditions | None], table: Indices
 ) -> dict[Condition, Array]:
@@ -363,7 +344,8 @@ def _find_places(session: Session, postures: Indices, values: Mapping[Condition,
     """
     setups = session.setups.values()
     noise = np.array([assumed_sigma(session.gauges[s.gauge]) for s in setups])
-    place = _number_rows(np.hstack([postures, values["approach"]]))
+    rows = np.hstack([postures, values["approach"]])
+    place = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
     for condition in ("temperature", "time"):
         for effect in robot_effects(session.robot):
             if condition in effect.conditions:
@@ -371,11 +353,6 @@ def _find_places(session: Session, postures: Indices, values: Mapping[Condition,
                 tolerance = np.array([effect.negligible_difference(condition, c) for c in changes])
                 place = _split_places(place, values[condition][:, 0], tolerance[postures[:, 0]])
     return place
-
-
-def _number_rows(rows: Array) -> Indices:
-    """Index of each row among the different rows, shape (n,)."""
-    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _split_places(place: Indices, value: Array, tolerance: Array) -> Indices:
@@ -512,11 +489,8 @@ def _missing_condition(session: Session, condition: Condition, missing: Sequence
     lines = [r.line for r in missing if (r.file or session.readings_path) == first]
     numbers = sorted({line for line in lines if line is not None})
     where = f" in {spans(numbers, 'line')}" if numbers else ""
-    column = COLUMNS_OF_CONDITIONS.get(condition)
-    if column is None:
-        return f"{condition} is missing{where}"
     empty = "missing or empty" if len(missing) == len(session.readings) else "incomplete"
-    return f"the column `{column}` is {empty}{where}"
+    return f"the column `{COLUMNS_OF_CONDITIONS[condition]}` is {empty}{where}"
 
 
 def readings_without(session: Session, condition: Condition) -> list[Reading]:
@@ -524,7 +498,7 @@ def readings_without(session: Session, condition: Condition) -> list[Reading]:
 
     A setup without any time needs none: its rows are in the order of time.
     """
-    if condition in ("adjustment", "coordinates"):  # the session states it
+    if condition not in COLUMNS_OF_CONDITIONS:  # the session states it, or it is computed
         return []
     if condition == "approach":
         return [r for r in session.readings if r.approach is None or "u" in r.approach]

@@ -26,7 +26,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import Parameter, ParameterSet, errors_at
+from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, split_assignment
 from orthocal.robot.redundant import require_independent_rows
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
@@ -321,7 +321,8 @@ def collect_errors(
     if draw is not None:
         models = robot.parameters.models
         is_model = draw in models
-        patterns = robot.parameters.patterns(draw) if is_model else tuple(draw.split(","))
+        names = tuple(name.strip() for name in draw.split(","))
+        patterns = robot.parameters.patterns(draw) if is_model else names
         if all(p.startswith("!") for p in patterns):
             raise ParameterError(
                 f"found '{draw}', which only excludes errors; expected errors to draw before it, "
@@ -340,9 +341,7 @@ def collect_errors(
         errors.update(load_errors(file, robot, nuisance, adjusted=adjusted))
     parameters = ParameterSet((), (*robot.parameters, *nuisance))
     for text in single:
-        key, equals, number = text.partition("=")
-        if not equals:
-            raise ParameterError(f"found '{text}'; expected NAME=VALUE", where="--error")
+        key, number = split_assignment(text, "NAME=VALUE", "--error")
         value = parse_number(number, where="--error", name=key, error=ParameterError)
         errors.update(read_errors({key: value}, parameters, where="--error"))
     if not errors:

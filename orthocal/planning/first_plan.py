@@ -13,7 +13,7 @@ from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.choice import Choice
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.motion.approach import state_common_approach
+from orthocal.measurement.motion.motion import state_program_approaches
 from orthocal.planning.candidates import ON_AXIS, directions_across
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name
 from orthocal.planning.expected_error import Expected, ToolForecast
@@ -263,7 +263,7 @@ def _read_legs(
         setups=setups,
         readings=tuple(readings),
     )
-    return state_common_approach(session)
+    return state_program_approaches(session)
 
 
 def _axis_of(leg: Leg) -> tuple[str, Array]:

@@ -290,6 +290,13 @@ def _settings(sections: Sections, probe: Array, where: str) -> DeltaSettings:
 
     The defaults of arm_length and position_endstop are those of tower a.
     """
+    printer = sections.get("printer", {})
+    kinematics = printer.get("kinematics", "delta")
+    if kinematics != "delta":
+        raise SessionError(
+            f"found '{shorten(kinematics)}'; expected delta",
+            where=f"{where}: [printer] kinematics",
+        )
     steppers = []
     for k in TOWERS:
         if f"stepper_{k}" not in sections:
@@ -303,7 +310,7 @@ def _settings(sections: Sections, probe: Array, where: str) -> DeltaSettings:
         _number(sections[f"stepper_{k}"], "angle", where, f"stepper_{k}", default=design / DEG)
         for k, design in zip(TOWERS, DESIGN_ANGLES, strict=True)
     ]
-    radius = _number(sections.get("printer", {}), "delta_radius", where, "printer")
+    radius = _number(printer, "delta_radius", where, "printer")
     return _with_endstops(radius, rods, angles, endstops, probe, where)
 
 

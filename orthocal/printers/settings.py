@@ -150,27 +150,29 @@ class DeltaSettings:
         Raises:
             SessionError: If a setting is implausible; names it.
         """
+        if problem := self.find_problem():
+            raise SessionError(problem, where=where)
+
+    def find_problem(self) -> str:
+        """First implausible setting, and what is expected; empty if all are plausible."""
         mean = float(np.mean(self.rods))
         for rod, tower in zip(self.rods, "abc", strict=True):
             if abs(rod - mean) > MAX_ROD_DIFFERENCE * mean:
                 others = ", ".join(f"{v / MM:g}" for v in self.rods)
-                raise SessionError(
+                return (
                     f"the rods of tower {tower} are {rod / MM:g} mm (a, b, c: {others}); expected "
-                    f"at most {100 * MAX_ROD_DIFFERENCE:g} % from their mean: state measured "
-                    "lengths, not the result of a fit",
-                    where=where,
+                    f"measured lengths, at most {100 * MAX_ROD_DIFFERENCE:g} % from their mean"
                 )
         low, high = (self.radius * ratio for ratio in RODS_PER_RADIUS)
         if not low <= mean <= high:
-            raise SessionError(
+            return (
                 f"rods of {mean / MM:g} mm with a radius of {self.radius / MM:g} mm; expected "
-                f"{low / MM:g} to {high / MM:g} mm",
-                where=where,
+                f"{low / MM:g} to {high / MM:g} mm"
             )
         for angle, design, tower in zip(self.angles, DESIGN_ANGLES, "abc", strict=True):
             if abs(angle - design) > MAX_TOWER_ANGLE:
-                raise SessionError(
+                return (
                     f"tower {tower} is at {angle / DEG:g}°; expected {design / DEG:g}° within "
-                    f"{MAX_TOWER_ANGLE / DEG:g}°",
-                    where=where,
+                    f"{MAX_TOWER_ANGLE / DEG:g}°"
                 )
+        return ""

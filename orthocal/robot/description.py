@@ -235,8 +235,8 @@ class RobotKeys(Keys):
                     f"orthocal.drives.{motor} is not in name_mot; motors: "
                     f"{', '.join(self.name_mot)}"
                 )
-        for name, kind in zip(closures or {}, self.type, strict=False):
-            rows = (closures or {})[name].rows
+        for (name, entry), kind in zip((closures or {}).items(), self.type, strict=False):
+            rows = entry.rows
             if rows is None:
                 continue
             if not rows or len(set(rows)) != len(rows):

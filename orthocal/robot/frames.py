@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import pinocchio as pin
 
 from orthocal.arrays import Array
@@ -37,9 +38,8 @@ def parent_frame(model: pin.Model, frame: int) -> int | None:
     """Parent frame on the same joint, whose errors move this frame; None if there is none."""
     f = model.frames[frame]
     parent = int(f.parentFrame)
-    if f.type == pin.FrameType.JOINT or frame == parent:
-        return None
-    return parent if model.frames[parent].parentJoint == f.parentJoint else None
+    same_joint = model.frames[parent].parentJoint == f.parentJoint
+    return parent if same_joint and frame != parent else None
 
 
 def carriers(model: pin.Model, frame: int) -> Iterator[int]:
@@ -55,24 +55,33 @@ def nearest_carrier(model: pin.Model, frame: int, frames: Container[int]) -> int
     return next((f for f in carriers(model, frame) if f != frame and f in frames), None)
 
 
-def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:
+def frame_jacobian(model: pin.Model, data: pin.Data, frame: int) -> Array:
+    """Jacobian of a frame's velocity and angular velocity in the world, shape (6, nv).
+
+    Args:
+        model: The model.
+        data: Its data after `computeJointJacobians` and `updateFramePlacements`.
+        frame: Index of the frame.
+    """
+    world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    # a vector for a model of one joint
+    return np.reshape(pin.getFrameJacobian(model, data, frame, world), (6, model.nv))
+
+
+def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[int, Array]) -> None:
     """Write frame errors into a model: placement · exp6(δ). Child frames move with their parents.
 
     Args:
         model: The model to change.
         nominal: The model without errors.
-        twists: Names of frames, mapped to their errors δ, shape (6,), [m, rad].
+        twists: Indices of frames, mapped to their errors δ, shape (6,), [m, rad].
     """
     moved: dict[int, pin.SE3] = {}
-    errors = {find_frame(nominal, name, where="frame"): t for name, t in twists.items()}
     for i, frame in enumerate(nominal.frames):
-        parent = frame.parentFrame
-        error = errors.get(i)
-        is_carried = nominal.frames[parent].parentJoint == frame.parentJoint and parent in moved
-        if frame.type == pin.FrameType.JOINT or (error is None and not is_carried):
+        carrier, placement = parent_frame(nominal, i), frame.placement
+        if carrier is not None and carrier in moved:
+            placement = moved[carrier] * nominal.frames[carrier].placement.inverse() * placement
+        elif i not in twists:
             continue
-        placement = frame.placement
-        if is_carried:
-            placement = moved[parent] * nominal.frames[parent].placement.inverse() * placement
-        moved[i] = placement if error is None else placement * pin.exp6(error)
+        moved[i] = placement * pin.exp6(twists[i]) if i in twists else placement
         model.frames[i].placement = moved[i]

@@ -27,7 +27,7 @@ from orthocal.robot.description import (
     RodKeys,
     load_description,
 )
-from orthocal.robot.frames import find_frame
+from orthocal.robot.frames import find_frame, frame_jacobian
 from orthocal.robot.model import (
     Closure,
     Drive,
@@ -37,6 +37,7 @@ from orthocal.robot.model import (
     Tcp,
     Use,
     build_constraints,
+    coordinate_limits,
     joint_axis,
 )
 from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
@@ -251,10 +252,7 @@ def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> D
     entry = keys.orthocal.drives.get(motor, DriveKeys())
     joint_keys = entry.joint or JointKeys()
     zero = _in_drive_unit(entry, "zero", unit, here) or 0.0
-    lower, upper = -np.inf, np.inf
-    if joint.nq == 1:
-        limits = model.lowerPositionLimit, model.upperPositionLimit
-        lower, upper = (float(v[joint.idx_q]) for v in limits)
+    lower, upper = (float(limits[joint.idx_v]) for limits in coordinate_limits(model))
     if _has_zero(keys, motor) and not lower <= zero <= upper:
         name, size = DRIVE_UNITS[unit]
         raise RobotError(
@@ -384,12 +382,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> Mapping[str, Leg]:
             )
             for rod, rod_keys in entry.rods.items()
         }
-        jacobian = pin.getFrameJacobian(
-            model,
-            data,
-            find_frame(model, entry.root, where=here),
-            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-        )[:3]
+        jacobian = frame_jacobian(model, data, find_frame(model, entry.root, where=here))[:3]
         by_passive = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
         motion = jacobian[:, robot.drive_index].sum(axis=1)
         motion /= max(float(np.linalg.norm(motion)), 1e-9)

@@ -24,8 +24,8 @@ from orthocal.units import DRIVE_UNITS, InUnit, Unit, format_fixed
 PARALLEL_SINE = 0.02
 """Sine of the largest angle between a slide and a leg that counts as parallel to it."""
 
-TRAVEL_SLACK = 1e-9
-"""Rounding error by which a coordinate may exceed the travel of a drive, [m, rad]."""
+LIMIT_TOLERANCE = 1e-9
+"""Rounding error by which a coordinate may exceed the limits of its joint, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ class Drive(InUnit):
         """True where drive coordinates, any shape, [unit], exceed the travel."""
         values = np.asarray(coordinate, dtype=np.float64)
         return np.asarray(
-            (values < self.lower - TRAVEL_SLACK) | (values > self.upper + TRAVEL_SLACK)
+            (values < self.lower - LIMIT_TOLERANCE) | (values > self.upper + LIMIT_TOLERANCE)
         )
 
     def describe_beyond(self, coordinate: float) -> str:
@@ -406,7 +406,7 @@ class Robot:
         Returns:
             All joint coordinates, and the residual.
         """
-        lower, upper = coordinate_limits(self)
+        lower, upper = coordinate_limits(self.model)
         data = self.model.createData()
 
         def complete(values: Array) -> Array:
@@ -457,6 +457,7 @@ class Robot:
             constraint.calc(self.model, data, cdata)
             error = np.array(cdata.constraint_position_error)
             jacobian = constraint.jacobian(self.model, data, cdata)
+            jacobian = jacobian.reshape(error.size, self.model.nv)  # a vector for one joint
             if closure.kind == "6d":  # Pinocchio differentiates the pose, not its logarithm
                 c1mc2 = cdata.c1Mc2
                 jacobian = pin.Jlog6(c1mc2) @ c1mc2.toActionMatrixInverse() @ jacobian
@@ -511,11 +512,11 @@ class Robot:
             twists: Placements, mapped to their twists δ, shape (6,), [m, rad].
         """
         model = self.model.copy()
-        frames: dict[str, Array] = {}
+        frames: dict[int, Array] = {}
         for placement, twist in twists.items():
             delta = np.asarray(twist, dtype=np.float64)
             if placement.of_frame:
-                frames[str(model.frames[placement.index].name)] = delta
+                frames[placement.index] = delta
             else:
                 i = placement.index
                 model.jointPlacements[i] = model.jointPlacements[i] * pin.exp6(delta)
@@ -623,9 +624,8 @@ def coordinate_units(robot: Robot) -> Array:
     return np.where(coordinate_turns(robot.model), robot.characteristic_length, 1.0)
 
 
-def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
+def coordinate_limits(model: pin.Model) -> tuple[Array, Array]:
     """Lower and upper bounds of the joint coordinates, shape (nv,) each; infinite if unbounded."""
-    model = robot.model
     lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     single = np.flatnonzero(np.array(model.nqs) == 1)
     in_q, in_v = np.array(model.idx_qs)[single], np.array(model.idx_vs)[single]

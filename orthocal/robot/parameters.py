@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
-from glob import escape, has_magic
 from typing import Any, Literal
 
 import numpy as np
@@ -184,8 +183,8 @@ class ParameterSet:
             )
         patterns = self._models[model]
         if patterns == COMPLETE:
-            return tuple(escape(name) for name in self.complete)
-        return (*patterns, *(escape(name) for name in self.of_effects))
+            return self.complete
+        return (*patterns, *self.of_effects)
 
     @cached_property
     def complete(self) -> tuple[str, ...]:
@@ -260,14 +259,7 @@ class ParameterSet:
         """
         chosen: set[str] = set()
         for pattern in patterns:
-            glob = composed(pattern.removeprefix("!"))
-            names = [glob] if glob in self._parameters else []
-            if has_magic(glob):
-                names = [name for name in self._parameters if fnmatchcase(name, glob)]
-            if not names:
-                raise ParameterError(
-                    f"'{glob}' matches no error parameter{suggest(glob, self._parameters)}"
-                )
+            names = _match(pattern.removeprefix("!"), self._parameters)
             if pattern.startswith("!"):
                 chosen.difference_update(names)
             else:
@@ -486,12 +478,10 @@ def build_parameters(
         parameters[parameter.name] = parameter
     for key, value in overrides.items():
         glob, unit, factor = split_unit(key)
-        names = [name for name in parameters if fnmatchcase(name, glob)]
-        if not names:
-            raise ParameterError(
-                f"tolerances.overrides: '{glob}' matches no error parameter"
-                f"{suggest(glob, parameters)}"
-            )
+        try:
+            names = _match(glob, parameters)
+        except ParameterError as e:
+            raise ParameterError(f"tolerances.overrides: {e.problem}") from None
         for name in names:
             _check_unit(key, unit, parameters[name])
             parameters[name] = replace(parameters[name], prior_std=read_limit(value) * factor)
@@ -532,6 +522,19 @@ def _sum_errors(
     return Parameter(name, first.unit, first.prior_std, tuple(terms.items()))
 
 
+def _match(pattern: str, names: Collection[str]) -> list[str]:
+    """Names that a glob matches; a name matches itself, whatever its characters.
+
+    Raises:
+        ParameterError: If there is none; suggests similar names.
+    """
+    glob = composed(pattern)
+    matched = [glob] if glob in names else [name for name in names if fnmatchcase(name, glob)]
+    if not matched:
+        raise ParameterError(f"'{glob}' matches no error parameter{suggest(glob, names)}")
+    return matched
+
+
 def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
     """Refuse a key whose unit is not that of the parameter."""
     if unit != parameter.unit:
@@ -558,3 +561,15 @@ def errors_at(where: str) -> Iterator[None]:
         yield
     except ParameterError as e:
         raise ParameterError(e.problem, where=e.where or where) from None
+
+
+def split_assignment(text: str, form: str, where: str) -> tuple[str, str]:
+    """Key and value of an option such as KEY=VALUE, which may have blanks.
+
+    Raises:
+        ParameterError: If there is no '='.
+    """
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ParameterError(f"found '{text}'; expected {form}", where=where)
+    return composed(key.strip()), value.strip()

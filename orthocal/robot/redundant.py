@@ -140,7 +140,7 @@ def _sensitivity(
         for p in owners
     ]
     twists = np.hstack(
-        [*(f.toActionMatrix() for f in frames), data.J[:, robot.passive_index.tolist()]]
+        [*(f.toActionMatrix() for f in frames), data.J.reshape(6, -1)[:, robot.passive_index]]
     )
 
     def motion(point: Array) -> Array:

@@ -18,6 +18,7 @@ from orthocal.errors import RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import MAX_STEPS, Closing, describe_opening
 from orthocal.robot.model import (
+    LIMIT_TOLERANCE,
     Robot,
     closure_row_units,
     closure_turns,
@@ -38,9 +39,6 @@ MAX_OPERATIONS = 2e8
 
 NULL_SPACE_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
-
-LIMIT_TOLERANCE = 1e-9
-"""Distance from a joint limit that counts as a rounding error, [m or rad]."""
 
 SNAP_DISTANCE = 1e-3
 """Distance from its zero at which a drive is set to its zero, [rad] or characteristic lengths."""
@@ -74,7 +72,7 @@ def find_reference_posture(
     Raises:
         RobotError: If no posture with closed loops is found; states the smallest opening.
     """
-    lower, upper = coordinate_limits(robot)
+    lower, upper = coordinate_limits(robot.model)
     start = robot.joint_coordinates(robot.drive_zero, passive_start)
     movable = robot.drive_index[~np.asarray(fixed_zeros, dtype=np.bool_)]
     start[movable] = np.clip(start[movable], lower[movable], upper[movable])
@@ -118,7 +116,7 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
 
 def _find_joints_outside_limits(robot: Robot, start: Array, free: Indices) -> list[str]:
     """Joints outside their limits in a posture that closes the loops if limits are ignored."""
-    lower, upper = coordinate_limits(robot)
+    lower, upper = coordinate_limits(robot.model)
     if not np.isfinite([lower[free], upper[free]]).any():
         return []
     closings = (
@@ -174,11 +172,11 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     """
     scales = _coordinate_scales(robot)
     values = _singular_values(robot, closing)
-    last = int((values > NULL_SPACE_TOLERANCE).sum()) - 1  # others belong to dependent rows
-    smallest = SINGULARITY_MARGIN * values[last]
+    independent = values > NULL_SPACE_TOLERANCE  # others belong to dependent rows
+    smallest = SINGULARITY_MARGIN * values[independent][-1:]  # none without passive joints
 
     def is_regular(candidate: Closing) -> bool:
-        return bool(_singular_values(robot, candidate)[last] >= smallest)
+        return bool((_singular_values(robot, candidate)[independent][-1:] >= smallest).all())
 
     free = np.concatenate([movable, robot.passive_index])
 
@@ -236,7 +234,7 @@ def _null_space(matrix: Array) -> Array:
 
 def _remove_full_turns(robot: Robot, coordinates: Array) -> Array:
     """Coordinates of unlimited passive joints reduced to ±π."""
-    unlimited = np.isinf(coordinate_limits(robot)).all(axis=0) & coordinate_turns(robot.model)
+    unlimited = np.isinf(coordinate_limits(robot.model)).all(axis=0) & coordinate_turns(robot.model)
     unlimited[robot.drive_index] = False
     turns = np.round(coordinates / (2.0 * np.pi))
     return np.where(unlimited, coordinates - 2.0 * np.pi * turns, coordinates)

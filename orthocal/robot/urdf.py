@@ -31,6 +31,10 @@ MOVING = ("revolute", "continuous", "prismatic")
 LIMITED = ("revolute", "prismatic")
 """Joint types with a <limit>."""
 
+_PARTS = ("link", "joint", "material")
+"""Elements of a robot. Others belong to other programs, such as <gazebo>, which has visuals of its
+own kind."""
+
 _NUMBERS: dict[str, dict[str, int]] = {
     "origin": {"xyz": 3, "rpy": 3},
     "dynamics": {"damping": 1, "friction": 1},
@@ -146,7 +150,7 @@ def _complete_limits(root: Element) -> list[str]:
 
 
 def parse_urdf(path: Path, *, content: bytes | None = None) -> Element:
-    """Root element of a URDF of limited size, without comments.
+    """Root element of a URDF of limited size, without comments and elements of other programs.
 
     Args:
         path: The file.
@@ -185,6 +189,9 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Element:
     count = sum(1 for _ in root.iter())
     if count > MOST_ELEMENTS:
         raise RobotError(f"has {count} elements; expected at most {MOST_ELEMENTS}", where=str(path))
+    for child in list(root):
+        if child.tag not in _PARTS:
+            root.remove(child)
     etree.strip_tags(root, etree.Comment)
     etree.strip_elements(root, etree.ProcessingInstruction, with_tail=False)
     for element in root.iter():

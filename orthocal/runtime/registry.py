@@ -44,9 +44,8 @@ class Registry(Generic[Kind]):
         self._registered[name] = self._read(name, kind)
 
     def unregister(self, name: str) -> None:
-        """Remove a kind if it exists."""
+        """Remove a registered kind if it exists; a built-in kind that it replaced returns."""
         self._registered.pop(name, None)
-        self._built_in.pop(name, None)
 
     @property
     def names(self) -> tuple[str, ...]:

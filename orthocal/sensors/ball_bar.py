@@ -37,7 +37,7 @@ from orthocal.sensors.protocol import (
     place_point,
     triple,
 )
-from orthocal.units import MM, read_tolerance, show_tolerance, to_mm
+from orthocal.units import MM, read_tolerance, show_mm, show_tolerance, to_mm
 
 CENTRE_STD = 1.0 * MM
 """Prior standard deviation of a coordinate of a fixed ball to which the tool was jogged, [m]."""
@@ -143,14 +143,14 @@ class BallBar(ToolSensor):
 
     def describe(self) -> str:
         """Short description with length and fixed ball."""
-        centre = ", ".join(f"{v / MM:g}" for v in self.centre)
-        return f"ball bar of {self.length / MM:g} mm about ({centre}) mm"
+        centre = ", ".join(map(show_mm, self.centre))
+        return f"ball bar of {show_mm(self.length)} mm about ({centre}) mm"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
         """Instructions for mounting the bar."""
-        x, y, z = (f"{v / MM:g}" for v in self.centre)
-        length = f"{self.length / MM:g} mm"
+        x, y, z = map(show_mm, self.centre)
+        length = f"{show_mm(self.length)} mm"
         known = "It is known" if not self.length_std else "Its true length need not be known"
         stays = ""
         if self.ball is not None:
@@ -252,7 +252,7 @@ class BallBar(ToolSensor):
         problems = [
             ""
             if abs(d - self.length) <= 0.5 * self.length
-            else f"the balls would be {d / MM:.1f} mm apart; the bar has {self.length / MM:g} mm"
+            else f"the balls would be {d / MM:.1f} mm apart; the bar has {show_mm(self.length)} mm"
             for d in distances.tolist()
         ]
         centre = np.array(self.centre)

@@ -55,10 +55,10 @@ def side_vector(axis: tuple[float, float, float], direction: Direction) -> Array
 
 
 def direction_name(direction: Direction) -> str:
-    """Name of a direction, or its vector in parentheses."""
+    """Name of a direction, or its vector in parentheses, with three digits."""
     if isinstance(direction, str):
         return direction
-    return f"({', '.join(f'{v:g}' for v in direction)})"
+    return f"({', '.join(f'{v:.3g}' for v in direction)})"
 
 
 def check_direction(direction: Direction, leg: Leg, largest_deg: float, *, where: str) -> None:

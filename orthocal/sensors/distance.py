@@ -13,15 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from pydantic import Field
 
 from orthocal.arrays import Array
-from orthocal.io.documents import Number
 from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.ball_bar import LARGEST_MM, Coordinate, Tolerance
 from orthocal.sensors.mounting import SCALE, ScaleTolerance
 from orthocal.sensors.protocol import (
     Contact,
@@ -32,19 +31,13 @@ from orthocal.sensors.protocol import (
     ToolSensor,
     View,
 )
-from orthocal.units import MM, read_tolerance, show_tolerance, to_mm
-
-LARGEST_MM = 5000.0
-"""Largest accepted distance and width, [mm]; a larger one has a wrong unit."""
-
-Width = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
-Tolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_MM)]
+from orthocal.units import MM, read_tolerance, show_mm, show_tolerance, to_mm
 
 
 class DistanceKeys(SetupKeys):
     """Keys of a setup of distances, as in a session.yaml."""
 
-    width_mm: Width = 0.0
+    width_mm: Coordinate = 0.0
     """Measured width of the pillar that the calliper includes."""
     width_tolerance_mm: Tolerance = 0.0
     """Tolerance of the width; 0 if it is known."""
@@ -96,16 +89,18 @@ class Distance(ToolSensor):
 
     def describe(self) -> str:
         """Short description with the width of the pillar."""
-        beyond = f", over a pillar of {self.width / MM:g} mm" if self.width else ""
+        beyond = f", over a pillar of {show_mm(self.width)} mm" if self.width else ""
         return f"printed distance{beyond}"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
         """Instructions for the operator."""
+        enter = "Enter the value that it shows, the width of the pillar included."
+        if not self.width:
+            enter = "Subtract the width of a pillar that the value includes, then enter it."
         return (
             "Print or mark the object at the positions of both postures, and let it cool down.",
-            "Measure the distance between both marks with a calliper. Enter the value that it "
-            "shows, the width of the pillar included.",
+            f"Measure the distance between both marks with a calliper. {enter}",
         )
 
     def frames(self, robot: Robot) -> Frames:

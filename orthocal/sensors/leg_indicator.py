@@ -49,7 +49,7 @@ from orthocal.sensors.protocol import (
     triple,
 )
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
-from orthocal.units import MM, to_mm
+from orthocal.units import MM, show_mm, to_mm
 
 Matrix = Any
 """Symbols or numbers of CasADi, or arrays."""
@@ -145,9 +145,9 @@ class Section:
     def describe(self) -> str:
         """Description of the position."""
         if self.form == "fraction":
-            return f"{self.value:g} of its length from the slide"
+            return f"{self.value:.3g} of its length from the slide"
         from_root = " from its hinge on the slide" if self.form == "from_root_mm" else ""
-        return f"{'' if from_root else 'coordinate '}{self.value / MM:g} mm{from_root}"
+        return f"{'' if from_root else 'coordinate '}{show_mm(self.value)} mm{from_root}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,12 +278,12 @@ class LegIndicator:
         words = f"leg {self.leg}, gauge in {direction}, at {self.section.describe()}"
         if self.rod is not None:
             words += f", {self.tip.form} on rod {self.rod}"
-        if any(self.beside):
-            offsets = [
-                f"{abs(v) / MM:g} mm towards {'+' if v > 0.0 else '−'}{axis}"
-                for axis, v in zip("xyz", self.beside, strict=True)
-                if v
-            ]
+        offsets = [
+            f"{show_mm(abs(v))} mm towards {'+' if v > 0.0 else '−'}{axis}"
+            for axis, v in zip("xyz", self.beside, strict=True)
+            if show_mm(v) != "0"
+        ]
+        if offsets:
             words += f", off its centre line by {' and '.join(offsets)}"
         return words
 

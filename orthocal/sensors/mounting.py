@@ -111,8 +111,9 @@ class Mounting:
             "section_tolerance_mm": (self.section, USUAL.section, MM),
             "lateral_tolerance_mm": (self.lateral, USUAL.lateral, MM),
             "scale_tolerance": (self.scale, USUAL.scale, 1.0),
-            "square_tolerance_mrad": (self.square, USUAL.square, MRAD),
         }
+        if self.stand is not None:
+            values["square_tolerance_mrad"] = (self.square, USUAL.square, MRAD)
         keys = {k: show_tolerance(v, unit) for k, (v, usual, unit) in values.items() if v != usual}
         return keys if self.stand is None else {**keys, "stand": self.stand}
 

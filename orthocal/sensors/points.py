@@ -43,7 +43,7 @@ from orthocal.sensors.protocol import (
     place_point,
     triple,
 )
-from orthocal.units import MM, MRAD, UM, read_tolerance, show_tolerance, tidy, to_mm
+from orthocal.units import MM, MRAD, UM, read_tolerance, show_mm, show_tolerance, tidy, to_mm
 
 LARGEST_MM = 100_000.0
 """Largest coordinate, [mm]: the reach of a laser tracker."""
@@ -212,7 +212,7 @@ class Points(ToolSensor):
 
     def describe(self) -> str:
         """Short description with coordinate and target."""
-        position = ", ".join(f"{v / MM:g}" for v in self.target)
+        position = ", ".join(map(show_mm, self.target))
         target = f"target at ({position}) mm" if any(self.target) else "target at the tool"
         if self.along is None:
             return f"position of a {target}"
@@ -224,7 +224,7 @@ class Points(ToolSensor):
     @property
     def mounting_steps(self) -> tuple[str, ...]:
         """Instructions for mounting the target."""
-        target = ", ".join(f"{v / MM:g}" for v in self.target)
+        target = ", ".join(map(show_mm, self.target))
         return (
             "Set up the instrument. It must not move until all points of its setups are measured.",
             f"Mount the target at the tool, ({target}) mm from the tool centre point.",

@@ -19,14 +19,13 @@ from pydantic import Field
 
 from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
+from orthocal.sensors.mounting import Millimetres, Milliradians
 from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View, triple
 from orthocal.sensors.tool_indicator import (
     ALIGNMENT_STD,
     LENGTH_MM,
     Artefact,
     Length,
-    Millimetres,
-    Milliradians,
     Point,
     ToolIndicator,
 )
@@ -62,7 +61,6 @@ class ProbeKeys(SetupKeys):
 class Probe(ToolIndicator):
     """Probe at the tool that triggers at a surface."""
 
-    scale_std: float = 0.0
     trigger_std: float = TRIGGER_STD
     """Prior standard deviation of the trigger height, [m]."""
 
@@ -120,7 +118,7 @@ class Probe(ToolIndicator):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and form of the surface, and the trigger height."""
-        surface = tuple(replace(p, fixed=True) for p in self._artefact_parameters())
+        surface = (replace(p, fixed=True) for p in self.artefact.nuisance_parameters)
         trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
         return (*surface, *trigger)
 

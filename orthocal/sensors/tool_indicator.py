@@ -32,7 +32,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.direction import direction_vector
-from orthocal.sensors.mounting import SCALE, ScaleTolerance, rotate
+from orthocal.sensors.mounting import SCALE, Millimetres, Milliradians, ScaleTolerance, rotate
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
@@ -45,7 +45,7 @@ from orthocal.sensors.protocol import (
     place_point,
     triple,
 )
-from orthocal.units import MM, MRAD, read_tolerance, show_tolerance, to_mm
+from orthocal.units import MM, MRAD, read_tolerance, show_mm, show_tolerance, to_mm
 
 ALIGNMENT_STD = 5.0 * MRAD
 """Prior standard deviation of the direction of an artefact aligned by eye, [rad]."""
@@ -64,8 +64,6 @@ Axis = Literal["x", "y", "z"]
 Point = Annotated[
     list[Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]], Field(min_length=3, max_length=3)
 ]
-Millimetres = Annotated[Number, Field(ge=0.0, le=40.0)]
-Milliradians = Annotated[Number, Field(ge=0.0, le=400.0)]
 Length = Annotated[PositiveNumber, Field(le=LARGEST_MM)]
 
 STRAIGHT = ("straight_2", "straight_3")
@@ -176,6 +174,32 @@ class Artefact:
     """Coordinate of the tool centre point along the plunger while the tip touches the plane beside
     the block, [m]."""
 
+    @property
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Direction and errors, if their standard deviation is above 0.
+
+        Both arms of a square share its yaw. A square that is turned over has another yaw.
+        """
+        owner = None if self.name is None else f"{self.kind}.{self.name}"
+        placement = f"{owner}.reversed" if owner and self.reversed else owner
+        arm = None if owner is None else f"{owner}.{self.along}"
+        is_edge = self.along is not None
+        forms = STRAIGHT if is_edge else flat_terms(self.form_degree)
+        share = np.array([1.0 if is_edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
+        form_std = self.form_std * share / np.linalg.norm(share)
+        yaw_owner = placement if self.kind == "square" else None
+        parameters = (
+            NuisanceParameter("yaw", "rad", self.direction_std, yaw_owner),
+            NuisanceParameter("roll", "rad", self.direction_std),
+            NuisanceParameter("square", "rad", self.square_std, owner),
+            *(
+                NuisanceParameter(name, "m", float(std), arm)
+                for name, std in zip(forms, form_std, strict=True)
+            ),
+            NuisanceParameter("height", "m", self.height_std),
+        )
+        return tuple(p for p in parameters if p.prior_std > 0.0)
+
 
 @dataclass(frozen=True, slots=True)
 class ToolIndicator(ToolSensor):
@@ -265,7 +289,7 @@ class ToolIndicator(ToolSensor):
         a = self.artefact
         words = a.kind.replace("_", " ")
         if a.kind == "gauge_block":
-            words += f" of {a.height / MM:g} mm"
+            words += f" of {show_mm(a.height)} mm"
         along = "" if a.along is None else f" along {a.along}"
         turned = ", turned over" if a.reversed else ""
         return f"indicator at the tool towards {self.direction}, {words}{along}{turned}"
@@ -278,7 +302,7 @@ class ToolIndicator(ToolSensor):
         if a.kind == "gauge_block":
             place = (
                 "Prepare a flat surface on the table. Where the posture is higher, put the gauge "
-                f"block of {a.height / MM:g} mm under the tip."
+                f"block of {show_mm(a.height)} mm under the tip."
             )
         elif a.along is None:
             place = f"Put the {words} on the table, square to the plunger by eye."
@@ -329,34 +353,8 @@ class ToolIndicator(ToolSensor):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and errors of the artefact and scale of the dial, if their std is above 0."""
-        return self._artefact_parameters()
-
-    def _artefact_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Nuisance parameters of the artefact and the dial.
-
-        Both arms of a square share its yaw. A square that is turned over has another yaw.
-        """
-        a = self.artefact
-        owner = None if a.name is None else f"{a.kind}.{a.name}"
-        placement = f"{owner}.reversed" if owner and a.reversed else owner
-        arm = None if owner is None else f"{owner}.{a.along}"
-        is_edge = a.along is not None
-        forms = STRAIGHT if is_edge else flat_terms(a.form_degree)
-        share = np.array([1.0 if is_edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
-        form_std = a.form_std * share / np.linalg.norm(share)
-        yaw_owner = placement if a.kind == "square" else None
-        parameters = (
-            NuisanceParameter("yaw", "rad", a.direction_std, yaw_owner),
-            NuisanceParameter("roll", "rad", a.direction_std),
-            NuisanceParameter("square", "rad", a.square_std, owner),
-            *(
-                NuisanceParameter(name, "m", float(std), arm)
-                for name, std in zip(forms, form_std, strict=True)
-            ),
-            NuisanceParameter("height", "m", a.height_std),
-            NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
-        )
-        return tuple(p for p in parameters if p.prior_std > 0.0)
+        scale = NuisanceParameter("scale", "1", self.scale_std, of_gauge=True)
+        return (*self.artefact.nuisance_parameters, *((scale,) * (self.scale_std > 0.0)))
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Reading with the gauge zero at 0, [m]."""

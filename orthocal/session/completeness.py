@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from numbers import Real
-from typing import NoReturn, get_args
+from collections.abc import Collection, Mapping
+from numbers import Integral, Real
+from typing import get_args
 
 import numpy as np
 
 from orthocal.effects.adjustment import require_adjustment
 from orthocal.errors import SessionError
+from orthocal.io.documents import MOST_SHOWN
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.sensors.protocol import GaugeZero
 from orthocal.session.differences import IndependentReadings
-from orthocal.session.session import Gauge, Posture, Reading, ReadingKey, Session, Setup
+from orthocal.session.session import (
+    Conditions,
+    Gauge,
+    Posture,
+    Reading,
+    ReadingKey,
+    Session,
+    Setup,
+)
 from orthocal.text import list_some
-
-MOST_NAMED = 8
-"""Largest number of names in a message."""
 
 
 def require_complete(session: Session) -> None:
@@ -32,7 +38,10 @@ def require_complete(session: Session) -> None:
     _require_named(session.setups, Setup, "setups")
     for name, gauge in session.gauges.items():
         _require_kind(gauge, Gauge, f"gauges.{name}")
-    _require_offsets(session, session.controller_offsets, "controller_offsets")
+    for name, posture in session.postures.items():
+        _require_drives(session, posture.drives, f"postures.{name}.drives")
+    if session.controller_offsets is not None:
+        _require_drives(session, session.controller_offsets, "controller_offsets")
     _require_adjustments(session, session.adjusted, "adjusted")
     for setup in session.setups.values():
         _require_setup(session, setup)
@@ -61,16 +70,15 @@ def _require_kind(value: object, kind: type, where: str) -> None:
         raise SessionError(f"found a {found}; expected a {expected}", where=where)
 
 
-def _require_offsets(session: Session, offsets: object, where: str) -> None:
-    """Refuse active offsets that are not one number for each drive; None if not stated."""
+def _require_drives(session: Session, values: object, where: str) -> None:
+    """Refuse drive coordinates or offsets that are not one number for each drive."""
     count = len(session.robot.drives)
-    if offsets is None or (
-        isinstance(offsets, np.ndarray) and offsets.shape == (count,) and np.isfinite(offsets).all()
+    if not (
+        isinstance(values, np.ndarray) and values.shape == (count,) and np.isfinite(values).all()
     ):
-        return
-    raise SessionError(
-        f"found {offsets!r}; expected an array of {count} numbers, in m or rad", where=where
-    )
+        raise SessionError(
+            f"found {values!r}; expected an array of {count} numbers, in m or rad", where=where
+        )
 
 
 def _require_adjustments(session: Session, adjusted: Mapping[str, float], where: str) -> None:
@@ -88,10 +96,9 @@ def _require_setup(session: Session, setup: Setup) -> None:
     if not hasattr(setup.sensor, "require_fit"):
         raise SessionError(f"found {setup.sensor!r}; expected a sensor", where=f"{where}.sensor")
     setup.sensor.require_fit(session.robot, where=where)
-    if setup.gauge not in session.gauges:
-        _refuse_name(setup.gauge, "gauge", session.gauges, where=where)
-    if setup.aligned_at is not None and setup.aligned_at not in session.postures:
-        _refuse_name(setup.aligned_at, "posture", session.postures, where=f"{where}.aligned_at")
+    require_name(setup.gauge, session.gauges, "gauge", where=where)
+    if setup.aligned_at is not None:
+        require_name(setup.aligned_at, session.postures, "posture", where=f"{where}.aligned_at")
     if setup.zero not in get_args(GaugeZero):
         expected = " or ".join(get_args(GaugeZero))
         raise SessionError(f"found {setup.zero!r}; expected {expected}", where=f"{where}.zero")
@@ -100,7 +107,8 @@ def _require_setup(session: Session, setup: Setup) -> None:
             f"found {setup.payload}; expected 0 or a positive number, in kg",
             where=f"{where}.payload",
         )
-    _require_offsets(session, setup.active, f"{where}.active")
+    if setup.active is not None:
+        _require_drives(session, setup.active, f"{where}.active")
     _require_adjustments(session, setup.adjusted or {}, f"{where}.adjusted")
 
 
@@ -113,24 +121,23 @@ def _require_readings(session: Session) -> None:
     if not session.readings:
         raise SessionError("there are none; expected at least one", where="readings")
     keys, independent = set[ReadingKey](), IndependentReadings()
+    zoned: dict[str, bool] = {}
     for r in session.readings:
         _require_kind(r, Reading, "readings")
-        if r.setup not in session.setups:
-            _refuse_name(r.setup, "setup", session.setups, where="readings")
+        require_name(r.setup, session.setups, "setup", where="readings")
         for posture in (r.posture, *([] if r.minus is None else [r.minus])):
-            if posture not in session.postures:
-                _refuse_name(posture, "posture", session.postures, where="readings")
+            require_name(posture, session.postures, "posture", where="readings")
         if not isinstance(r.value, Real) or math.isinf(r.value):
             raise SessionError(
                 f"found {r.value!r}; expected a finite number, in m", where=session.where(r)
             )
-        if r.cycle < 1:
+        if not isinstance(r.cycle, Integral) or r.cycle < 1:
             raise SessionError(
-                f"found the cycle {r.cycle}; expected at least 1", where=session.where(r)
+                f"found the cycle {r.cycle!r}; expected a whole number from 1",
+                where=session.where(r),
             )
-        approach = None if r.conditions is None else r.conditions.approach
-        if approach is not None and (problem := find_approach_problem(approach, session.robot)):
-            raise SessionError(f"approach: found {problem}", where=session.where(r))
+        if r.conditions is not None:
+            _require_conditions(session, r, r.conditions, zoned)
         if r.key in keys:
             raise SessionError(
                 f"repeats cycle {r.cycle}; count the repetitions: cycle 1, 2, …",
@@ -148,7 +155,43 @@ def _require_readings(session: Session) -> None:
         )
 
 
-def _refuse_name(name: str, noun: str, known: Mapping[str, object], *, where: str) -> NoReturn:
-    """Refuse an unknown name of a setup, a posture or a gauge."""
-    listed = list_some(list(known), MOST_NAMED)
-    raise SessionError(f"'{name}' is not a {noun}; {noun}s: {listed}", where=where)
+def _require_conditions(
+    session: Session, reading: Reading, conditions: Conditions, zoned: dict[str, bool]
+) -> None:
+    """Refuse conditions that do not fit the session.
+
+    Args:
+        session: The session.
+        reading: The reading with the conditions.
+        conditions: Its conditions.
+        zoned: Setups, mapped to whether their times have a time zone. A first time is added.
+    """
+    where = session.where(reading)
+    _require_kind(conditions, Conditions, where)
+    approach, time = conditions.approach, conditions.time
+    if approach is not None and (problem := find_approach_problem(approach, session.robot)):
+        raise SessionError(f"approach: found {problem}", where=where)
+    if not math.isfinite(conditions.temperature or 0.0):
+        raise SessionError(
+            f"temperature: found {conditions.temperature}; expected a finite number, in °C",
+            where=where,
+        )
+    if time is not None:
+        has_zone = time.tzinfo is not None
+        if zoned.setdefault(reading.setup, has_zone) != has_zone:
+            raise SessionError(
+                f"time: found {time}; expected all times of setup '{reading.setup}' with a time "
+                "zone, or all without one",
+                where=where,
+            )
+
+
+def require_name(name: str, known: Collection[str], noun: str, *, where: str) -> None:
+    """Refuse an unknown name of a setup, a posture or a gauge.
+
+    Raises:
+        SessionError: If the name is unknown; lists the known ones.
+    """
+    if name not in known:
+        listed = list_some(list(known), MOST_SHOWN)
+        raise SessionError(f"'{name}' is not a {noun}; {noun}s: {listed}", where=where)

@@ -5,13 +5,17 @@ from __future__ import annotations
 from orthocal.errors import SessionError
 from orthocal.session.session import Reading
 
+Node = tuple[str, int, str]
+"""Setup, cycle and posture."""
+
 
 class IndependentReadings:
     """Readings and differences of which none follows from others of its setup and cycle."""
 
     def __init__(self) -> None:
         self._absolute: set[tuple[str, int]] = set()
-        self._differences: dict[tuple[str, int], dict[str, str]] = {}
+        self._relative: set[tuple[str, int]] = set()
+        self._leaders: dict[Node, Node] = {}
 
     def add(self, reading: Reading, where: str) -> None:
         """Add a reading of a posture, or a difference; not one of a pair of postures.
@@ -28,17 +32,15 @@ class IndependentReadings:
         if reading.minus is None:
             self._absolute.add(group)
         else:
-            leaders = self._differences.setdefault(group, {})
-            first, second = (_find_leader(leaders, n) for n in (reading.posture, reading.minus))
-            if first == second:
+            self._relative.add(group)
+            if not connect(self._leaders, (*group, reading.posture), (*group, reading.minus)):
                 raise SessionError(
                     f"{reading.label} follows from the other differences of setup "
                     f"{reading.setup} in cycle {reading.cycle}; delete it, or use another cycle "
                     "if it was measured separately",
                     where=where,
                 )
-            leaders[first] = second
-        if group in self._absolute and group in self._differences:
+        if group in self._absolute and group in self._relative:
             raise SessionError(
                 f"setup {reading.setup} has both readings and differences in cycle "
                 f"{reading.cycle}; keep the readings only",
@@ -46,9 +48,16 @@ class IndependentReadings:
             )
 
 
-def _find_leader(leaders: dict[str, str], name: str) -> str:
-    """Union-find root of a posture among postures that differences connect (path halving)."""
-    while (parent := leaders.get(name, name)) != name:
-        leaders[name] = leaders.get(parent, parent)
-        name = parent
-    return name
+def connect(leaders: dict[Node, Node], first: Node, second: Node) -> bool:
+    """Connect two nodes by a difference; False if others connect them already."""
+    first, second = find_leader(leaders, first), find_leader(leaders, second)
+    leaders[first] = second
+    return first != second
+
+
+def find_leader(leaders: dict[Node, Node], node: Node) -> Node:
+    """Union-find root of a node among nodes that differences connect (path halving)."""
+    while (parent := leaders.get(node, node)) != node:
+        leaders[node] = leaders.get(parent, parent)
+        node = parent
+    return node

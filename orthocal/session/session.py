@@ -63,7 +63,7 @@ class Gauge:
         range: Lowest and highest reading, [m].
 
     Raises:
-        ValueError: If `sigma` or `resolution` is not positive, or the range not two numbers.
+        ValueError: If `sigma` or `resolution` is no positive number, or the range not two numbers.
     """
 
     sigma: float | None = None
@@ -72,7 +72,7 @@ class Gauge:
 
     def __post_init__(self) -> None:
         for name, value in (("sigma", self.sigma), ("resolution", self.resolution)):
-            if value is not None and not value > 0.0:
+            if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f"{name}: found {value!r}; expected a positive number, in m")
         if self.range is not None and not (len(self.range) == 2 and self.range[0] < self.range[1]):
             raise ValueError(

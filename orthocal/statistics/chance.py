@@ -11,6 +11,7 @@ from orthocal.arrays import Array
 from orthocal.statistics.distributions import (
     chi_square_tail,
     f_tail,
+    incomplete_beta,
     least_number,
     normal_quantile,
     t_quantile,
@@ -58,10 +59,7 @@ def chance_of_equal_readings(equal: int, count: int, *, sigma: float, step: floa
     chance = math.erf(1.0 / (s * math.sqrt(2.0))) + s * math.sqrt(2.0 / math.pi) * math.expm1(
         -0.5 / s**2
     )
-    return sum(
-        math.comb(count, k) * chance**k * (1.0 - chance) ** (count - k)
-        for k in range(equal, count + 1)
-    )
+    return incomplete_beta(equal, count - equal + 1.0, chance) if equal else 1.0  # binomial tail
 
 
 def confidence_factor(dof: float, level: float = 0.95) -> float:

@@ -151,18 +151,22 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
     total, dof = 0.0, 0
     for setup in np.unique(observations.setup):
         entries = np.flatnonzero(observations.setup == setup)
-        postures, at_posture = np.unique(observations.place[entries], return_inverse=True)
-        if len(postures) == len(entries):
+        at_place, at_zero = (
+            np.unique(index[entries], return_inverse=True)[1]
+            for index in (observations.place, observations.zero)
+        )
+        if at_place.max() + 1 == len(entries):
             continue
-        zeros, at_zero = np.unique(observations.zero[entries], return_inverse=True)
-        design = np.zeros((len(entries), len(postures) + len(zeros)))
-        rows = np.arange(len(entries))
-        design[rows, at_posture] = 1.0
-        design[rows, len(postures) + at_zero] = 1.0
-        solution, _, rank, _ = np.linalg.lstsq(design, values[entries], rcond=1e-9)
-        residual = values[entries] - design @ solution
+        # the more numerous ones are eliminated by their means, which takes less time
+        few, many = sorted((at_zero, at_place), key=np.max)
+        centred = np.column_stack([values[entries], np.eye(few.max() + 1)[few]])
+        means = np.zeros((many.max() + 1, centred.shape[1]))
+        np.add.at(means, many, centred)
+        centred -= (means / np.bincount(many)[:, None])[many]
+        solution, _, rank, _ = np.linalg.lstsq(centred[:, 1:], centred[:, 0], rcond=1e-9)
+        residual = centred[:, 0] - centred[:, 1:] @ solution
         total += float(residual @ residual)
-        dof += len(entries) - int(rank)
+        dof += len(entries) - len(means) - int(rank)
     return (float(np.sqrt(total / dof)) if dof else float("nan")), dof
 
 

@@ -22,6 +22,7 @@ from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.weighting import leverages
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
+from orthocal.session.points import base_name
 from orthocal.session.session import Session
 from orthocal.statistics.zeros import zero_shares
 from orthocal.study.runner import StudyTable
@@ -154,7 +155,7 @@ def find_cycles(session: Session, observations: Observations) -> tuple[tuple[Ind
         if len(cycles) < 2 or len(places) > 1:
             raise SessionError(
                 f"{problem}, or --by residuals",
-                where=f"{session.path or 'session'}: setups.{setup_names[setup]}",
+                where=f"{session.path or 'session'}: setups.{base_name(setup_names[setup])}",
             )
         cycles_of_setups.append(tuple(cycles))
     return tuple(cycles_of_setups)

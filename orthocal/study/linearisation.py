@@ -350,7 +350,12 @@ def build_linearisation_study(
 
 
 def _idealise(session: Session) -> Session:
-    """Session with readings of 0 and exact mountings."""
+    """Session of the same postures with readings of 0, exact mountings and no active offsets.
+
+    Errors are those that the active offsets do not correct: equations are linear about them.
+    """
+    if session.active_offsets.any():
+        session = session.with_controller(np.zeros(len(session.robot.drives)))
     setups = dict(session.setups)
     for name, setup in setups.items():
         sensor: Any = setup.sensor

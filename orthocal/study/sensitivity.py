@@ -86,12 +86,18 @@ def _tool_changes(
         Posture in words and coordinate, mapped to shape (n_machine,).
     """
     session, selection = problem.session, problem.machine_selection
+    active = dict(zip(selection.names, problem.active_theta.tolist(), strict=False))
     result = {}
     for approach in dict.fromkeys(a for _, a in places):
         names = list(dict.fromkeys(n for n, a in places if a == approach))
         drives = np.array([session.postures[n].drives for n in names])
         conditions = UseConditions(approach=approach)
-        tool = ToolSensitivity(session.robot, free=selection.names, conditions=conditions)
+        tool = ToolSensitivity(
+            session.robot,
+            free=selection.names,
+            values=active,
+            conditions=conditions,
+        )
         for name, changes in zip(names, tool(drives, names=names), strict=True):
             label = describe_postures(name, None, approach)
             for axis, change in zip(TOOL, changes * selection.prior_stds, strict=True):

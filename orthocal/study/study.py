@@ -21,8 +21,10 @@ from orthocal.arrays import Array
 from orthocal.effects.loading import load_robot_content, with_adjustments, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.measurement.files.write_session import session_document
+from orthocal.measurement.files.point_rows import is_of_row
+from orthocal.measurement.files.write_session import session_document, session_tables
 from orthocal.robot.model import Robot
+from orthocal.sensors.points import Points
 from orthocal.session.session import Session
 
 Cell = float | int | str | bool | None
@@ -113,15 +115,21 @@ class Study(ABC):
 
 def _session_record(session: Session) -> dict[str, Any]:
     """Plain data of a session, without the paths of its files."""
+    covariances = {
+        n: cast(Points, s.sensor).covariance for n, s in session.setups.items() if is_of_row(n)
+    }
     rows = "\n".join(
         f"{r.setup},{r.posture},{r.minus or ''},{r.cycle},{r.value!r}"
         + (f",{r.conditions}" if r.conditions else "")
+        + (f",{covariances[r.setup]}" if r.setup in covariances else "")
         for r in session.readings
     )
+    tables = session_tables(session)
     return {
         "robot": {"name": session.robot.name, "sha256": session.robot.sha256},
         "session": {**session_document(session), "robot": session.robot.name},
         "readings": hashlib.sha256(rows.encode()).hexdigest(),
+        **{name: hashlib.sha256(text.encode()).hexdigest() for name, text in tables.items()},
     }
 
 

@@ -54,11 +54,6 @@ def cylinder(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
     return _AlongZ(height, radius, radius, start=start)
 
 
-def cone(height: float, radius: float) -> g.Geometry:
-    """Cone along z whose base is at z = 0, [m]."""
-    return _AlongZ(height, radius, 0.0)
-
-
 def pose_along(origin: Array, direction: Array) -> Array:
     """Poses with z along unit vectors, shape (..., 4, 4), [m].
 
@@ -157,7 +152,7 @@ def draw_arrow(
     shaft = np.diag([*shafts[0], 1.0])
     head = translation_matrix(feet[0]) @ np.diag([*heads[0], 1.0])
     scene.add(f"{path}/shaft", cylinder(1.0, width / 2.0), look, shaft)
-    scene.add(f"{path}/head", cone(head_length(width), 1.3 * width), look, head)
+    scene.add(f"{path}/head", _AlongZ(head_length(width), 1.3 * width, 0.0), look, head)
     if times is not None:
         scene.track(f"{path}/shaft", "scale", "vector3", times, shafts)
         scene.track(f"{path}/head", "position", "vector3", times, feet)

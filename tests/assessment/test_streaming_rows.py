@@ -16,6 +16,7 @@ from orthocal.cli import printing
 from orthocal.errors import SessionError
 from orthocal.io.files import read_lines
 from orthocal.measurement.files import coordinate_tables as table
+from orthocal.units import MM
 
 HEADER = "x_mm,y_mm,z_mm\n"
 
@@ -50,6 +51,12 @@ def test_a_pipe_gives_what_a_file_gives(orthocal, tmp_path):
     back = orthocal("forward", found[1])[1].splitlines()[1:]
     again = np.array([[float(v) for v in line.split(",")] for line in back])
     assert np.abs(again - points).max() < 1e-3
+
+
+def test_rows_have_no_negative_zero():
+    rows = np.array([[-1e-12, 2.0], [-0.6e-9, np.nan], [-0.6e-9, 0.4e-9]])
+    text = table.format_rows({"x_mm": MM, "y_mm": MM}, rows)
+    assert text.split() == ["0.000000,2000.000000", ",", "-0.000001,0.000000"]
 
 
 def test_a_wrong_line_of_a_pipe_is_named_and_what_came_before_is_served(orthocal, tmp_path):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
+import shutil
 
 import pytest
 from calibrated import UNJUDGED, calibrated, session_of
@@ -47,6 +49,32 @@ def test_a_calibration_is_repeated_from_its_file(tmp_path, names, model, loss, s
     for p, q in zip(made.setups, again.setups, strict=True):
         assert (p.zero is None) == (q.zero is None)
         assert p.zero is None or q.zero == pytest.approx(p.zero, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        "leg: y, direction: z, section: {fraction: 0.5}",
+        "sensor: ball_bar, centre_mm: [50, 0, -100], length_mm: 100",
+        "sensor: tool_indicator, direction: z, artefact: {kind: plate}",
+        "sensor: probe",
+        "sensor: points",
+    ],
+)
+def test_a_setup_without_readings_is_no_obstacle(root, tmp_path, keys):
+    """It has not been measured yet, and its gauge has not been read."""
+    folder = tmp_path / "session"
+    shutil.copytree(root / "examples/table1/experiment-2", folder)
+    text = (folder / "session.yaml").read_text()
+    text = re.sub(r"(?m)^gauge: (\{.*\}).*", r"gauges: {a: \1, b: {sigma_mm: 0.002}}", text)
+    text = text.replace(": {leg:", ": {gauge: a, leg:")
+    text = text.replace("\nsetups:", f"\nsetups:\n  later: {{gauge: b, {keys}}}")
+    (folder / "session.yaml").write_text(text)
+    made, _ = identify(folder, solver="variable-projection")
+    loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
+    again = repeat_calibration(loaded, restore_session(loaded))
+    assert again.offsets == pytest.approx(made.offsets, abs=1e-9)
+    assert again.offsets == pytest.approx(calibrated("table1/experiment-2").offsets, abs=1e-9)
 
 
 @pytest.mark.parametrize("loss", ["huber", "squares"])

@@ -26,6 +26,7 @@ from orthocal import (
 )
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
+from orthocal.effects.backlash import Backlash
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.rods import stretch_rod
 from orthocal.errors import OrthocalError, ParameterError, RobotError, SessionError
@@ -139,6 +140,17 @@ def test_a_parameter_of_another_effect_is_refused(tmp_path):
     finally:
         registry.unregister_effect("other")
     assert caught.value.where.endswith("orthocal.effects.other")
+
+
+def test_a_replaced_effect_returns():
+    class Replaced(Backlash):
+        pass
+
+    registry.register_effect(Replaced)
+    kinds = [registry.find_effect("backlash", where="", error=RobotError)]
+    registry.unregister_effect("backlash")
+    kinds.append(registry.find_effect("backlash", where="", error=RobotError))
+    assert kinds == [Replaced, Backlash]
 
 
 @pytest.mark.parametrize(

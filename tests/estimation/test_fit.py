@@ -164,6 +164,20 @@ def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
     assert finding.numbers["sigma_mm"] == pytest.approx(result.noise.sigma * 1e3)
 
 
+@pytest.mark.parametrize(("resolution", "sigma"), [(None, 10e-6), (1e-6, 10.004e-6)])
+def test_an_unknown_noise_is_assumed(raw_cycles, resolution, sigma):
+    """The last sigma of the iteration, here 3 µm, is that of residuals without freedom."""
+    rows = tuple(r for r in raw_cycles.readings if r.cycle == 1)
+    once = replace(raw_cycles, readings=rows).with_gauge(Gauge(None, resolution))
+    problem = build_problem(once, model="full")
+    options = SolverOptions(solver="variable-projection")
+    fit = fit_problem(problem, options=options)
+    assert fit.noise.source == "unknown"
+    assert fit.sigma == pytest.approx(sigma, rel=1e-4)
+    again = fit.program.solve(sigma=fit.sigma)
+    assert np.abs((again.theta - fit.solution.theta) / problem.theta_scale).max() < SAME_OPTIMUM
+
+
 def test_readings_are_weighted_by_the_scatter_of_their_gauge(root):
     """One gauge scatters ten times as much as stated, which only the residuals show."""
     plan = load_plan(root / "examples/sweep/plan.yaml")
@@ -188,6 +202,21 @@ def test_readings_are_weighted_by_the_scatter_of_their_gauge(root):
     assert found.solution.theta == pytest.approx(known.solution.theta, abs=1e-8)
     unweighted = NonlinearProgram(with_gauges(session, 5e-6)).solve(sigma=5e-6)
     assert np.abs(unweighted.theta - known.solution.theta).max() > 1e-6
+
+
+def test_the_rounding_of_one_gauge_is_not_the_noise_of_another(raw_cycles):
+    """Few readings of a gauge that states nothing, and of a dial that is read to 0.1 mm."""
+    setups = {
+        name: replace(s, gauge="coarse" if i % 2 else "silent")
+        for i, (name, s) in enumerate(raw_cycles.setups.items())
+    }
+    rows = tuple(r for r in raw_cycles.readings if r.cycle == 1)
+    gauges = {"silent": Gauge(), "coarse": Gauge(resolution=1e-4)}
+    session = replace(raw_cycles, setups=setups, gauges=gauges, readings=rows)
+    options = SolverOptions(solver="variable-projection")
+    silent, _ = fit_problem(build_problem(session, model="full"), options=options).noises.gauges
+    assert silent.source != "gauge"
+    assert silent.dof < np.inf
 
 
 def test_correlations_are_those_of_the_covariance(session):

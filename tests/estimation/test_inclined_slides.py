@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from orthocal import load_robot
-from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide
+from orthocal.builder.orthoglide import InclinedOrthoglide
 from orthocal.estimation.linear import leg_parallelism_matrix, twelve_row_covariance
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.planning.equipment import place_tool
@@ -20,6 +20,9 @@ ENDS = (0.06, -0.1)
 """Displacements along a leg, [m] (paper, section 4)."""
 
 LENGTH = 0.31025
+
+ORTHOGONAL = np.arcsin(np.sqrt(1.0 / 3.0))
+"""Elevation of orthogonal slides, [rad]."""
 
 
 def across(direction):

@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from calibrated import SOUND
+from calibrated import SOUND, calibrated
 from commands import run_orthocal
 from effect_plans import write_plan
 from linuxcnc import Joint, few_nodes, play, require_linuxcnc, run_program
@@ -356,6 +356,27 @@ def test_second_export_under_the_exported_tables_is_the_same(under_tables):
     for e in find_screws(under):  # straight lines between rows that are 0.106 of a turn apart
         size = np.linalg.norm(e.identified)
         assert e.active == pytest.approx(np.sinc(0.106) ** 2 * e.identified, abs=0.01 * size)
+
+
+def test_a_table_that_is_kept_moves_with_home_offset():
+    """An exact table stays exact: its trims at each position of the slide do not change."""
+    calibration = calibrated("table1/experiment-2")
+    joints = np.linspace(0.1, 0.4, 256)
+    wave = 1e-5 * np.sin(joints / (0.2 * MM))
+    trim = JointTrim(0.0, np.column_stack([joints, wave + 5e-6, wave - 5e-6]))
+    record = replace(calibration.session, compensation=(JointTrim(), trim, JointTrim(2e-5)))
+    calibration = replace(calibration, session=record)
+    options = ExportOptions(home_offsets=(0.3, 0.3, 0.3))
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    moved = np.loadtxt(files["joint_1.comp"].splitlines()) * MM
+    shift = offsets_to_enter(calibration)[1] - calibration.active_offsets[1]
+    assert abs(shift) > 0.1 * MM
+    assert moved - trim.table == pytest.approx(np.tile([shift, 0.0, 0.0], (256, 1)), abs=1e-9)
+    assert home_offsets(files["joints.ini"]) == pytest.approx(
+        (0.3 + offsets_to_enter(calibration)) / MM, abs=1e-4
+    )
+    assert "move with HOME_OFFSET" in files["README.md"]
+    assert "as during the measurement. Keep" in files["README.md"]
 
 
 @pytest.fixture(scope="module")

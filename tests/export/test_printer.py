@@ -17,6 +17,7 @@ from simulated_printer import Printer, nominal, read_settings, rings, write_log,
 
 from orthocal import (
     ExportError,
+    assess,
     calibrate,
     draw_errors,
     draw_scene,
@@ -29,6 +30,7 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.printer_settings import _find_targets, fit_firmware
+from orthocal.assessment.wording import tool_mm
 from orthocal.calibration.refit import restore_covariances, restore_session
 from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -110,6 +112,36 @@ def test_walk_of_the_owner_of_a_printer(tmp_path):
     promise = promised((tmp_path / "new" / "README.md").read_text())
     assert np.sqrt(np.mean(after**2)) < PROMISE * promise
     assert promise < 0.05
+    compared = run_orthocal(tmp_path, "compare", "bed", "--models", "full").stdout
+    fit = fit_firmware(load_calibration(tmp_path / "one"), firmware)
+    row = next(line.split() for line in compared.splitlines() if line.split()[:1] == ["full"])
+    errors = [tool_mm(fit.expect_tool(e)) for e in (fit.now, fit.new)]
+    assert " ".join(row).startswith(f"full {' '.join(errors)} ")
+    (tmp_path / "part.gcode").write_text("G21 G90\nG1 X9 F600\n")
+    for command in (  # which know no settings of a firmware
+        ("correct", "one", "part.gcode", "--out", "corrected.gcode"),
+        ("export", "one", "--to", "table", "--out", "refused"),
+        ("export", "one", "--to", "linuxcnc", "--offsets", "--out", "refused"),
+        ("again", "one", "--out", "refused"),
+    ):
+        done = run_orthocal(tmp_path, *command)
+        assert (done.returncode, f"--to {firmware}" in done.stderr) == (2, True)
+
+
+def test_implausible_settings_are_not_proposed(calibrated):
+    """All towers are 0.18 rad from their places. The export refuses this, too."""
+    _, calibration = calibrated
+    angles = (210 * DEG, 330 * DEG, 90 * DEG - 0.18)
+    firmware = replace(calibration.session.firmware, angles=angles)
+    session = replace(calibration.session, firmware=firmware)
+    turned = replace(calibration, session=session, assessment=None)
+    assessment = assess(turned, judgement=SOUND)
+    (finding,) = assessment.of_kind("settings unknown")
+    assert "tower a is at 19" in finding.text
+    assert assessment.decision.reason == finding.text
+    with pytest.raises(ExportError) as refused:
+        export_calibration(replace(turned, assessment=assessment), "klipper")
+    assert finding.text.endswith(f"{refused.value.problem[1:]}.")
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -22,6 +23,7 @@ from orthocal.io.files import (
     write_file,
     write_files,
 )
+from orthocal.io.journal import open_journal_file
 
 NO_FILE = "is a device, a pipe or a socket; expected a file"
 
@@ -177,6 +179,14 @@ def test_looking_whether_a_folder_can_be_written_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_cannot_be_cleaned_up_does_not_prevent_writing(tmp_path):
+    """As the file of another user in /tmp; a directory, because the tests may run as root."""
+    left = tmp_path / f".orthocal-{2**22}-{16 * '0'}.tmp"
+    left.mkdir()
+    write_file(tmp_path / "file", "text")
+    assert sorted(f.name for f in tmp_path.iterdir()) == [left.name, "file"]
+
+
 def test_what_a_killed_run_left_is_cleaned_up_by_the_next(tmp_path):
     done = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"],
                           capture_output=True, text=True, check=True)  # fmt: skip
@@ -299,3 +309,22 @@ def test_content_of_a_robot_file_behind_a_link_is_not_quoted(kind, root, secret,
         load_robot(folder)
     assert "combination" not in str(caught.value)
     assert caught.value.where.startswith(str(file))
+
+
+def test_a_line_that_does_not_fit_leaves_nothing_in_a_journal(tmp_path, monkeypatch):
+    """The disk is full in the middle of the line, and has space for the next one."""
+    write = os.write
+
+    def write_the_beginning(descriptor, data):
+        if len(data) < 10:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(descriptor, data[:5])
+
+    with open_journal_file(tmp_path / "journal", busy="busy") as journal:
+        journal.append({"a": 1})
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "write", write_the_beginning)
+            with pytest.raises(OutputError, match="No space left"):
+                journal.append({"b": "long"})
+        journal.append({"c": 2})
+    assert (tmp_path / "journal").read_text() == '{"a": 1}\n{"c": 2}\n'

@@ -83,6 +83,11 @@ def test_mutated_documents(load):
             for form in ("{}", "-{}", "0x{}", "{}.5")
             for digits in (101, 4301)
         ),
+        # 48, 90, 1000 and 16 for YAML
+        *(
+            (f"a: [80, {n}]", f"found {n}; expected")
+            for n in ("060", "-060", "1:30", "1_000", "0x10")
+        ),
         *(
             (f"title: {value}", "could not determine a constructor for the tag")
             for value in FOREIGN_TAGS
@@ -96,6 +101,10 @@ def test_refused_documents(load, text, problem):
     assert problem in caught.value.problem
     assert len(caught.value.problem) < 500
     assert caught.value.problem_mark is not None
+
+
+def test_zeros_of_decimal_numbers_are_accepted(load):
+    assert load("[0, -0, 0.5, 060.0, 1.0e+03]") == [0, 0, 0.5, 60.0, 1000.0]
 
 
 def test_redundant_tags_are_accepted(load):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import closed_form
 import numpy as np
 import pytest
+from linkages import joint, make_robot
 from tolerances import CLOSED, CLOSED_FORM
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics import continuation
-from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.loop_closure import LoopClosure, find_beyond_travel, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.measurement.files.coordinate_tables import drive_columns
 
 LENGTH = 0.31025
 
@@ -162,6 +166,27 @@ def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
         nominal_closure(orthoglide).close(joints, names=["near", "far"])
     assert caught.value.posture == "far"
     assert caught.value.residual > 0.01
+
+
+def test_the_travel_of_a_revolute_drive_is_in_the_unit_of_its_column(fivebar):
+    motor = replace(fivebar.drives[0], lower=-np.pi / 2, upper=np.pi / 2)
+    robot = replace(fivebar, drives=(motor, *fivebar.drives[1:]))
+    (failure,) = find_beyond_travel(robot, np.array([[np.pi, 0.0]])).values()
+    assert failure.reason == "motor_a_deg is 180; the drive reaches from -90 to 90"
+    assert f"{motor.name}_deg" in drive_columns(robot)
+
+
+def test_a_hinge_of_a_machine_with_rods_of_1_m_has_limits_in_degrees(tmp_path):
+    """A parallelogram: the hinge turns back as far as the motor turns."""
+    limit = '<limit lower="-0.5" upper="0.5" effort="1" velocity="1"/>'
+    joints = joint("j0", "base", (0, 0, 0), "z") + joint("j1", "j0", (1, 0, 0), "z", limit=limit)
+    joints += joint("j2", "j1", (0, 1, 0), "z") + joint("end", "j2", (-1, 0, 0), "")
+    joints += joint("post", "base", (0, 1, 0), "")
+    yaml = "closed_loop: [[end, post]]\ntype: [3d]\nname_mot: [j0]\n"
+    yaml += "orthocal: {closures: {loop: {rows: [x, y]}}}\n"
+    closure = LoopClosure(make_robot(tmp_path / "large", joints, yaml))
+    with pytest.raises(ClosureError, match=r"at -57\.3 deg, outside its limits -28\.6"):
+        closure.close([1.0])
 
 
 def test_coordinates_that_are_not_numbers_are_refused(orthoglide):

@@ -29,6 +29,11 @@ def as_function(build):
     return lambda xi: [np.asarray(v.full()) for v in function.call([xi])]
 
 
+def logarithm(rotation, position):
+    """The expression of the logarithm, at arrays."""
+    return np.asarray(ca.DM(log6(ca.SX(rotation), ca.SX(position))))[:, 0]
+
+
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exponential_and_logarithm_equal_pinocchios(angle):
     xi = twist_of(angle)
@@ -38,7 +43,7 @@ def test_exponential_and_logarithm_equal_pinocchios(angle):
     assert np.abs(position - expected.translation).max() < KINEMATICS
     # near half a turn the logarithm itself is ill-conditioned
     slack = KINEMATICS * (1.0 if angle < 2.0 else 100.0)
-    assert np.abs(log6(rotation, position) - xi).max() < slack
+    assert np.abs(logarithm(rotation, position) - xi).max() < slack
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -50,7 +55,7 @@ def test_expressions_equal_arrays(angle):
     )(xi)
     assert np.abs(rotation - pose[0]).max() < KINEMATICS
     assert np.abs(position[:, 0] - pose[1]).max() < KINEMATICS
-    assert np.abs(twist[:, 0] - log6(*pose)).max() < 10 * KINEMATICS
+    assert np.abs(twist[:, 0] - logarithm(*pose)).max() < 10 * KINEMATICS
     assert np.abs(right - right_jacobian(xi)).max() < KINEMATICS
 
 
@@ -88,7 +93,7 @@ def test_the_right_jacobian_is_the_derivative_of_the_exponential(angle):
 
     def local(other):
         turned, moved = exp6(other)
-        return log6(rotation.T @ turned, rotation.T @ (moved - position))
+        return logarithm(rotation.T @ turned, rotation.T @ (moved - position))
 
     numeric = central_differences(local, xi)
     assert np.abs(numeric - right_jacobian(xi)).max() < DERIVATIVE
@@ -98,12 +103,11 @@ def test_batches_equal_single_twists():
     xi = np.array([[twist_of(a, s) for a in ANGLES] for s in (1, 2, 3)])
     rotations, positions = exp6(xi)
     assert rotations.shape == (3, len(ANGLES), 3, 3)
-    logarithms, jacobians = log6(rotations, positions), right_jacobian(xi)
+    jacobians = right_jacobian(xi)
     for at in np.ndindex(xi.shape[:-1]):
         rotation, position = exp6(xi[at])
         assert np.array_equal(rotations[at], rotation)
         assert np.array_equal(positions[at], position)
-        assert np.array_equal(logarithms[at], log6(rotation, position))
         assert np.array_equal(jacobians[at], right_jacobian(xi[at]))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linkages
 import numpy as np
 import pytest
 
@@ -111,3 +112,25 @@ def test_an_invalid_workspace_is_named_by_file_and_key(tmp_path, box, message):
         load_robot(yaml.parent)
     assert str(yaml) in str(e.value)
     assert message in str(e.value)
+
+
+def test_radians_and_metres_of_drives_are_not_compared(tmp_path):
+    """An arm of 80 mm that turns and a slide along it: both move the tool alike."""
+    joints = linkages.joint("turn", "base", (0, 0, 0), "z")
+    joints += linkages.joint("slide", "turn", (0.08, 0, 0), "x", kind="prismatic")
+    yaml = "closed_loop: []\ntype: []\nname_mot: [turn, slide]\n"
+    yaml += "orthocal: {tcp: {frame: slide, coordinates: [x, y]}}\n"
+    robot = linkages.make_robot(tmp_path / "polar", joints, yaml)
+    assert find_workspace(robot).half_side > 0.03
+
+
+def test_a_machine_with_a_free_motion_has_no_workspace(tmp_path):
+    """A closure that the free hinge does not change."""
+    joints = linkages.joint("turn", "base", (0, 0, 0), "z")
+    joints += linkages.joint("tool", "turn", (0.1, 0, 0), "")
+    joints += linkages.joint("free", "base", (0, 0, 0), "z")
+    yaml = "closed_loop: [[base, free]]\ntype: [3d]\nname_mot: [turn]\northocal:\n"
+    yaml += "  closures: {post: {rows: [z]}}\n  tcp: {frame: tool, coordinates: [y]}\n"
+    robot = linkages.make_robot(tmp_path / "free", joints, yaml)
+    with pytest.raises(ClosureError, match="no box of ±1 mm"):
+        find_workspace(robot)

@@ -42,7 +42,7 @@ from orthocal.measurement.motion.approach import (
     approach_share,
 )
 from orthocal.measurement.motion.guidance import shown_joints
-from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.motion.motion import plan_motion, state_program_approaches
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.output.sheet.page import sheet_files
 from orthocal.session.session import Conditions, Gauge, Reading
@@ -217,6 +217,18 @@ def test_an_approach_is_no_longer_than_the_dial_allows(small, half, backlash, le
     for motion in plan_motion(session):
         for stop in motion.stops:
             assert stop.drives - stop.approach_drives == pytest.approx([length] * 3)
+
+
+@pytest.mark.parametrize(("half", "approach"), [(0.4e-3, "ppp"), (5e-3, "nnn")])
+def test_readings_without_an_approach_get_that_of_the_program(small, half, approach):
+    """A drive ends 1 mm below its shortest coordinate: only a short approach is from below."""
+    robot = with_effects(small.robot, ["backlash"])
+    least = min(p.drives[0] for p in small.postures.values())
+    robot = replace(robot, drives=(replace(robot.drives[0], lower=least - 1e-3), *robot.drives[1:]))
+    session = replace(small, robot=robot).with_gauge(replace(small.gauge, range=(-half, half)))
+    assert {r.approach for r in state_program_approaches(session).readings} == {approach}
+    for motion in plan_motion(session):
+        assert {s.approach for s in motion.stops} == {approach}
 
 
 @pytest.fixture(scope="module")
@@ -576,6 +588,14 @@ def test_a_ball_bar_keeps_its_length_between_its_readings(bar):
         assert stop.posture != before.posture
 
 
+def test_readings_of_a_bar_without_an_approach_get_that_of_their_path(bar):
+    session = replace(bar, robot=with_effects(bar.robot, ["backlash"]))
+    stated = state_program_approaches(session)
+    (motion,) = plan_motion(stated)
+    read = [s.approach for s in motion.stops if s.role == "reading"]
+    assert [r.approach for r in stated.readings] == read
+
+
 @pytest.mark.parametrize("aligned_at", ["a", "c"])
 def test_a_program_waits_before_it_moves_where_a_fixed_ball_may_stand(bar, aligned_at):
     """It names its first posture, in machine coordinates, where the ball stays."""
@@ -647,6 +667,22 @@ def warnings_of(session):
     page = lxml.html.fromstring(sheet_files(session)["sheet.html"])
     shown = [row[-3].text_content() for row in page.xpath("//table[contains(@class,'boxes')]//tr")]
     return shown[1:], [p.text_content() for p in page.xpath("//p[@class='warn']")]
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        "{sensor: probe, direction: -z, surface: plane, zero: free}",
+        "{sensor: points, target_mm: [0, 0, -40], zero: free}",
+    ],
+)
+def test_an_instrument_without_a_dial_has_no_bezel_and_no_plunger(directory, sensor):
+    plan = f"{PLAN[: PLAN.index('setups:')]}setups:\n  s: {sensor}\n"
+    (directory / "free.yaml").write_text(plan)
+    files = sheet_files(load_plan(directory / "free.yaml"))
+    assert len(files) == 2  # the sheet and one program
+    for text in files.values():
+        assert not re.search(r"set the dial|bezel|plunger|the hand must", text)
 
 
 @pytest.mark.parametrize(

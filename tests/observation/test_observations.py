@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,9 @@ from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 from orthocal import load_plan, load_session
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
-from orthocal.observation.observations import build_observations
+from orthocal.observation.observations import build_observations, readings_without
 from orthocal.sensors.leg_indicator import Section
+from orthocal.session.session import Reading
 
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 
@@ -138,6 +140,24 @@ def test_differences_are_taken_apart_into_readings_with_a_zero_each(tmp_path, ro
     assert np.array_equal(covariance[:2, :2], [[2.0, 1.0], [1.0, 2.0]])
     expected = incidence.T @ np.linalg.inv(covariance) @ incidence
     assert np.abs(projector - expected).max() < KINEMATICS
+
+
+def test_values_of_many_groups_of_differences_take_little_time(raw_cycles):
+    """10 000 cycles of one difference each: a search for each group would take a minute."""
+    first, second = list(raw_cycles.postures)[:2]
+    rows = tuple(Reading("yx", first, second, cycle, 1e-8 * cycle) for cycle in range(1, 10_001))
+    session = replace(raw_cycles, readings=rows)
+    o = build_observations(session)
+    began = time.process_time()
+    values = o.values(session.values)
+    assert time.process_time() - began < 5.0
+    assert np.abs(o.rows(values) - session.values).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("condition", ["load", "adjustment", "coordinates", "reference"])
+def test_conditions_without_a_column_are_never_missing(raw_cycles, condition):
+    """They are computed. An effect with such a condition and a parameter can be identified."""
+    assert readings_without(raw_cycles, condition) == []
 
 
 def test_contacts_move_along_the_leg_with_the_posture(raw_cycles):

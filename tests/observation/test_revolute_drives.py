@@ -221,9 +221,11 @@ def test_printed_keys_of_mixed_drives_are_those_of_a_session(tmp_path):
     read = load_mixed(tmp_path / "again", f"{{{keys}}}").active_offsets
     assert np.abs(read - offsets).max() < KINEMATICS
     lines = "".join(f"[JOINT_{i}]\nHOME_OFFSET = 0\n" for i in range(3))
-    (tmp_path / "joints.ini").write_text(f"# controller: {{{keys}}}\n{lines}")
-    stated = read_controller_joints(tmp_path / "joints.ini", robot).offsets
-    assert stated == pytest.approx(offsets, abs=KINEMATICS)
+    for newline in ("\n", "\r\n"):
+        text = f"# controller: {{{keys}}}\n{lines}"
+        (tmp_path / "joints.ini").write_text(text, newline=newline)
+        stated = read_controller_joints(tmp_path / "joints.ini", robot).offsets
+        assert stated == pytest.approx(offsets, abs=KINEMATICS)
 
 
 @pytest.mark.parametrize(

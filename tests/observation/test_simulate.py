@@ -156,6 +156,17 @@ def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):
     )
 
 
+def test_errors_may_be_stated_with_blanks(orthoglide):
+    """As in the options of `calibrate`."""
+    single, draw = ["y_slide.offset_mm = 3"], "x_slide.offset, *_leg.length, !z_leg.*"
+    assert list(collect_errors(orthoglide, single=single, draw=draw)) == [
+        "x_slide.offset",
+        "x_leg.length",
+        "y_leg.length",
+        "y_slide.offset",
+    ]
+
+
 def test_a_setup_has_the_nuisance_parameter_that_is_stated(plan):
     """The others are drawn as without it."""
     setup = next(iter(plan.setups))

@@ -115,7 +115,7 @@ EXPLAINED = {
     "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),
     "model error beside cycles": (lambda c, e: every_time(c), {"ratio": 6.27}),
     "noise from residuals": (lambda c, e: once(c), {}),
-    "noise unknown": (lambda c, e: three_rows(e), {}),
+    "noise unknown": (lambda c, e: three_rows(e), {"sigma_mm": 0.0104}),
     "no redundancy": (lambda c, e: three_stated_rows(e), {"parameters": 3.0}),
 }
 """Kinds of findings that explain a fit, the calibration, and numbers."""

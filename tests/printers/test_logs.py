@@ -254,6 +254,7 @@ RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
         ("hello\n", "log.txt", "no known firmware"),
         (KLIPPER + MARLIN, "log.txt", "several"),
         (KLIPPER.replace("delta_radius: 140.000000", "delta_radius: x"), "[printer]", "'x'"),
+        (KLIPPER.replace("kinematics: delta", "kinematics: corexy"), "[printer] kin", "'corexy'"),
         (KLIPPER.replace("microsteps: 16", "m: 1"), "[stepper_a]", "microsteps"),
         (KLIPPER.replace("arm_length: 280.0", "arm_length: 1620.0", 1), "log.txt", "1620"),
         (KLIPPER.replace("height1_pos = ", "height1_pos = 1,"), "height1_pos", "4 numbers"),
@@ -411,6 +412,8 @@ def test_options_of_tables_are_refused_for_a_log(tmp_path):
         done = run_orthocal(tmp_path, "import", "printer.cfg", "bed")
         assert done.returncode == code
     assert "exists already; choose another directory" in done.stderr
+    done = run_orthocal(tmp_path, "import", "printer.cfg", "bed/printer")
+    assert (done.returncode, "directory of a robot" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("height", [-17.2, 0.0, 4.0])

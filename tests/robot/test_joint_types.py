@@ -148,3 +148,16 @@ def test_a_limit_below_the_0_that_is_left_out_is_named(tmp_path):
     folder = write_robot(tmp_path / "j", joint("j0", "base", (0, 0, 0), "z", limit=limit), YAML)
     with pytest.raises(RobotError, match=r"above its upper limit \(lower is 0"):
         load_robot(folder)
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        '<gazebo reference="j0"><visual><material/></visual><collision/></gazebo>',
+        '<gazebo><plugin name="p"><origin xyz="a"/><geometry/></plugin></gazebo>',
+        '<transmission name="t"><joint name="j0"/><mass value="of no robot"/></transmission>',
+    ],
+)
+def test_elements_of_other_programs_are_ignored(tmp_path, element):
+    robot = make_robot(tmp_path / "arm", chain(ARM) + element, YAML)
+    assert robot.model.njoints == 4

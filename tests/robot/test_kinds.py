@@ -18,9 +18,10 @@ from orthocal import load_robot
 from orthocal.builder.biglide import Biglide
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.builder.machine_file import KINDS
-from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthoglide
+from orthocal.builder.orthoglide import InclinedOrthoglide, Orthoglide
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.reachable_box import describe_unreachable_box
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.output.text.plan import describe_basis
 from orthocal.planning.candidates import list_candidates
@@ -172,7 +173,7 @@ def test_the_tool_is_where_pinocchio_closes_the_loops(tmp_path, machine):
 
 def test_orthogonal_slides_make_an_orthoglide(tmp_path, orthoglide):
     """Equal but for the orientation of the world."""
-    machine = InclinedOrthoglide(elevation=ORTHOGONAL)
+    machine = InclinedOrthoglide(elevation=np.arcsin(np.sqrt(1.0 / 3.0)))
     robot = written(tmp_path, machine)
     axes = np.column_stack([leg.direction for leg in machine.legs()])
     assert np.abs(axes.T @ axes - np.eye(3)).max() < KINEMATICS
@@ -280,3 +281,11 @@ def test_kinds_and_their_usual_dimensions_are_possible():
         assert kind.kind == name
         assert kind().find_problem() is None
     assert SINGLE.find_problem() is None
+
+
+@pytest.mark.parametrize(("rod", "radius"), [(0.28, 0.14), (0.1277, 0.1), (0.1112, 0.1)])
+def test_the_rods_of_a_delta_reach_its_default_workspace(tmp_path, rod, radius):
+    """Short rods around a large radius leave little room, but some."""
+    delta = LinearDelta(rod=rod, radius=radius, travel=(0.005, 0.56))
+    robot = written(tmp_path, delta)
+    assert describe_unreachable_box(robot, robot.workspace) == ""

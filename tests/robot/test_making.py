@@ -11,6 +11,7 @@ import yaml
 from tolerances import CLOSED_FORM
 
 from orthocal.builder.build import describe_machine, make_robot, remake_robot
+from orthocal.builder.linear_delta import LinearDelta
 from orthocal.builder.machine_file import KINDS, MACHINE, Counting, read_machine
 from orthocal.builder.orthoglide import FEET, Orthoglide
 from orthocal.errors import RobotError
@@ -117,6 +118,14 @@ def test_machines_of_every_kind_are_made_again_from_one_file(tmp_path, kind):
     assert {p.name: p.read_text() for p in folder.iterdir()} == before
 
 
+def test_the_default_workspace_of_a_delta_follows_its_dimensions(tmp_path):
+    make_robot(LinearDelta(), tmp_path / "mine")
+    file = tmp_path / "mine" / MACHINE
+    file.write_text(file.read_text().replace("radius_mm: 140", "radius_mm: 100"))
+    fresh = make_robot(LinearDelta(radius=0.1), tmp_path / "fresh")
+    assert (remake_robot(tmp_path / "mine").workspace == fresh.workspace).all()
+
+
 def test_a_file_without_a_kind_is_of_an_orthoglide(tmp_path):
     make_robot(SMALL, tmp_path / "mine")
     file = tmp_path / "mine" / MACHINE
@@ -159,6 +168,16 @@ def test_a_size_that_makes_no_machine_is_named_by_its_key(tmp_path, old, new, me
         remake_robot(folder)
     assert message in str(e.value)
     assert (folder / "mine.urdf").read_text() == before
+
+
+def test_a_description_that_is_not_utf_8_is_refused_and_stays(tmp_path):
+    make_robot(SMALL, tmp_path / "mine")
+    described = tmp_path / "mine/mine.yaml"
+    content = described.read_bytes() + "# geprüft\n".encode("latin-1")
+    described.write_bytes(content)
+    with pytest.raises(RobotError, match=r"mine\.yaml: is not UTF-8 text"):
+        remake_robot(tmp_path / "mine")
+    assert described.read_bytes() == content
 
 
 def test_a_description_without_a_place_for_a_size_is_named(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import linkages
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,6 +13,12 @@ from tolerances import KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import RobotError
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.kinematics.conditions import UseConditions
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.sensitivity import ToolSensitivity
+
+WARM = UseConditions(temperature=40.0)
 
 
 def test_the_orthoglide_is_the_designed_machine(orthoglide):
@@ -114,6 +121,20 @@ def test_an_offset_moves_the_slider_by_itself(orthoglide):
     assert np.abs(slider - [0.0, 0.31225, 0.0]).max() < KINEMATICS
 
 
+@pytest.mark.parametrize("pairs", ["", "[slide, post]"])
+def test_a_machine_may_be_a_single_joint(tmp_path, pairs):
+    joints = linkages.joint("slide", "base", (0, 0, 0), "x", kind="prismatic")
+    joints += linkages.joint("end", "slide", (0.1, 0, 0), "")
+    joints += linkages.joint("post", "base", (0, 0, 0), "")
+    yaml = f"closed_loop: [{pairs}]\ntype: [{'3d' if pairs else ''}]\nname_mot: [slide]\n"
+    yaml += "orthocal: {tcp: {frame: end, coordinates: [x]}, legs: {x: {root: slide, tip: end}}}\n"
+    robot = linkages.make_robot(tmp_path / "slide", joints, yaml)
+    assert np.array_equal(robot.legs["x"].root_motion, [1.0, 0.0, 0.0])
+    assert "slide.offset" in robot.parameters.complete
+    error = ToolSensitivity(robot, free=["slide.offset"])([0.0], passive=np.zeros((1, 0)))
+    assert np.abs(error[0, :, 0] - [1.0, 0.0, 0.0]).max() < KINEMATICS
+
+
 def test_read_only_arrays_cannot_be_written_to(orthoglide):
     with pytest.raises(ValueError, match="read-only"):
         orthoglide.reference_posture[0] = 1.0
@@ -131,6 +152,32 @@ def test_the_same_files_give_the_same_robot_until_one_is_changed(root, tmp_path)
     assert load_robot(folder).drive_zero == pytest.approx([0.21, 0.21])
     path.write_text(text)
     assert load_robot(folder) is first
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "evaluate"),
+    [
+        (  # the other rod does not become warm
+            "        b: {root: y_bar_b",
+            "      # b: {root: y_bar_b",
+            lambda r: LoopClosure(r, conditions=WARM).forward(r.drive_zero).tolist(),
+        ),
+        ("full: complete", "full: ['*.offset']", machine_errors),
+    ],
+)
+def test_an_edited_robot_has_nothing_of_the_one_before(root, tmp_path, old, new, evaluate):
+    source = root / "robots/biglide"
+    urdf, yaml = (next(source.glob(f"*.{suffix}")).read_text() for suffix in ("urdf", "yaml"))
+    yaml += "  effects: {thermal: {}}\n"
+    edited = yaml.replace(old, new)
+    results = []
+    for name, text in (("edited", yaml), ("edited", edited), ("new", edited)):
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.urdf").write_text(urdf)
+        (folder / f"{name}.yaml").write_text(text)
+        results.append(evaluate(load_robot(folder)))
+    assert results[1] == results[2] != results[0]
 
 
 def test_a_folder_of_another_name_is_another_robot(root, tmp_path, monkeypatch):

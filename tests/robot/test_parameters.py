@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from linkages import joint, make_robot
 from models import JOINTS
 
 from orthocal.errors import ParameterError
@@ -28,6 +29,18 @@ def test_patterns_add_and_take_out_in_their_order(orthoglide):
     p = orthoglide.parameters
     assert p.select(["*.offset", "!y_*"]) == ("x_slide.offset", "z_slide.offset")
     assert p.select(["!y_*", "*.offset"]) == tuple(f"{k}_slide.offset" for k in "xyz")
+
+
+def test_a_name_with_the_characters_of_a_glob_matches_itself(tmp_path):
+    yaml = "closed_loop: []\ntype: []\nname_mot: ['j[0]', j0]\n"
+    overrides = "orthocal: {tolerances: {overrides: {'j[0].offset_mm': 3}}}\n"
+    slides = [joint(n, "base", (0, 0, 0), "x", kind="prismatic") for n in ("j[0]", "j0")]
+    p = make_robot(tmp_path / "slides", "".join(slides), yaml + overrides).parameters
+    assert p.select(["j[0].offset"]) == ("j[0].offset",)
+    assert p.select(["j[0].off*"]) == ("j0.offset",)
+    assert p.select_model("full")[:2] == ("j[0].offset", "j0.offset")
+    assert p["j[0].offset"].prior_std == pytest.approx(1.5e-3)
+    assert p["j0.offset"].prior_std == pytest.approx(5e-3)
 
 
 def test_a_pattern_that_matches_nothing_suggests(orthoglide):

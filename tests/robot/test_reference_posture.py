@@ -71,6 +71,14 @@ def test_drives_without_a_zero_are_moved_until_the_loops_close(tmp_path):
     LoopClosure(robot).close(robot.drive_zero + 0.01)
 
 
+def test_drives_without_passive_joints_close_a_loop_alone(tmp_path):
+    """Two slides along one line, 0.2 apart: each comes half of the way."""
+    slides = [joint(f"s{i}", "base", (0.2 * i, 0, 0), "x", kind="prismatic") for i in range(2)]
+    yaml = "closed_loop: [[s0, s1]]\ntype: [3d]\nname_mot: [s0, s1]\n"
+    robot = make_robot(tmp_path / "slides", "".join(slides), yaml)
+    assert np.abs(robot.drive_zero - [0.1, -0.1]).max() < KINEMATICS
+
+
 def test_a_given_zero_is_kept(tmp_path):
     """One drive is told where it is: only the other one moves."""
     extra = "  drives: {motor_a: {zero_deg: 150}}\n"

@@ -22,6 +22,8 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
 from orthocal.sensors.points import fit_station
+from orthocal.study.bootstrap import build_bootstrap_study
+from orthocal.study.sensitivity import build_sensitivity_study
 from orthocal.units import MM
 
 SIGMA = 10e-6
@@ -100,6 +102,41 @@ def test_grossly_wrong_points_do_not_move_the_station(wrong):
     mistyped[wrong[1:], 0] += 0.1
     assert fit_station(mistyped, targets) == expected
     assert fit_station(points, targets) != expected
+
+
+def test_points_in_one_cycle_cannot_be_resampled_by_cycles(tmp_path):
+    """The message names the setup of the file."""
+    session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=3).session
+    with pytest.raises(SessionError, match="one cycle") as refused:
+        build_bootstrap_study(session, "offsets", by="cycles", draws=2)
+    assert refused.value.where.endswith("setups.track")
+
+
+@pytest.mark.parametrize(
+    ("keys", "name"),
+    [
+        ("", "z_mm"),
+        (f", covariance_um2: {COVARIANCE_UM2}", r"the coordinate along principal axis \d"),
+    ],
+)
+def test_a_coordinate_out_of_range_is_named(tmp_path, keys, name):
+    """Most points are missing: those that are read decide between a wrong unit and one mistake."""
+    plan = grid(tmp_path, keys, side=2)
+    number_by_posture = {p: 100.0 for p in [*plan.postures][:3]}
+    number_by_posture["p2"] = 4e7
+    rows = (f"track,{p},1,2,{number_by_posture.get(p)}" for p in plan.postures)
+    rows = (row.replace(",1,2,None", ",,,") for row in rows)
+    text = "setup,posture,x_mm,y_mm,z_mm\n" + "\n".join(rows)
+    (tmp_path / "readings.csv").write_text(text)
+    (tmp_path / "plan.yaml").write_text(
+        (tmp_path / "plan.yaml").read_text() + "readings: readings.csv\n"
+    )
+    wrong = []
+    load_plan(tmp_path / "plan.yaml", wrong=wrong)
+    (error,) = wrong
+    assert error.where.endswith(":4")
+    assert re.match(name, error.problem)
+    assert "decimal point" in error.problem
 
 
 def tracked(folder):
@@ -210,6 +247,10 @@ def test_a_row_can_state_its_covariance(tmp_path):
     again = load_session(tmp_path / "again")
     np.testing.assert_allclose(again.values, found.values, atol=2e-9)
     assert list(again.setups) == list(found.setups)
+    # along the same axes, the values of a study do not show the covariance
+    file.write_text(file.read_text().replace(",25,36,49,", ",25,64,49,"))
+    sessions = (found, load_session(file.parent))
+    assert len({build_sensitivity_study(s, ["*.offset"]).digest for s in sessions}) == 2
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import ObservationModel, predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.sensors.mounting import Mounting
+from orthocal.sensors.registry import read_setup, write_sensor
 from orthocal.sensors.tips import touch_by_ball
 
 PLAN = """robot: orthoglide
@@ -213,6 +215,23 @@ def test_it_is_written_and_read(tmp_path):
     loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
     assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups]
     assert {s.sensor.describe().rpartition(", ")[2] for s in loaded.setups} == {"blade on rod a"}
+
+
+def test_descriptions_state_lengths_to_a_micrometre_and_directions_to_three_digits():
+    section = Section("coordinate_mm", -0.1031234567)
+    line = LegIndicator("x", (0.0, np.sqrt(0.75), 0.5), section)
+    assert line.describe() == "leg x, gauge in (0, 0.866, 0.5), at coordinate -103.123 mm"
+    ball = line.on_rod("a", Tip("ball", 0.0015), (0.0, -0.0001234567, 2e-7))
+    assert ball.describe().endswith(", off its centre line by 0.123 mm towards −y")
+
+
+def test_a_written_mounting_is_read():
+    """The squareness of a block has no key without a block."""
+    mounting = Mounting(square=0.0)
+    sensor = LegIndicator("x", "y", Section("fraction", 0.5), mounting)
+    keys, read = read_setup(write_sensor(sensor), where="", under="", error=SessionError)
+    assert keys.square_tolerance_mrad is None
+    assert read.nuisance_parameters == sensor.nuisance_parameters
 
 
 def test_a_ball_that_passes_the_rod_is_named_before_measuring(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -25,6 +26,12 @@ def first_reading(session, **changes):
     )
 
 
+def first_posture(session, **changes):
+    """Session whose first posture is changed."""
+    name, posture = next(iter(session.postures.items()))
+    return replace(session, postures={**session.postures, name: replace(posture, **changes)})
+
+
 def first_setup(session, **changes):
     """Session whose first setup is changed."""
     name, setup = next(iter(session.setups.items()))
@@ -43,6 +50,29 @@ WRONG = {
     "infinite": (lambda s: first_reading(s, value=np.inf), "csv:2", "found inf"),
     "text": (lambda s: first_reading(s, value="1"), "csv:2", "found '1'"),
     "cycle": (lambda s: first_reading(s, cycle=0), "csv:2", "found the cycle 0"),
+    "part of a cycle": (lambda s: first_reading(s, cycle=1.5), "csv:2", "found the cycle 1.5"),
+    "coordinates": (
+        lambda s: first_posture(s, drives=np.zeros(2)),
+        "postures.zero.drives",
+        "expected an array of 3",
+    ),
+    "conditions": (lambda s: first_reading(s, conditions="ppp"), "csv:2", "expected a Conditions"),
+    "temperature": (
+        lambda s: first_reading(s, conditions=Conditions(temperature=np.nan)),
+        "csv:2",
+        "temperature: found nan",
+    ),
+    "time zones": (
+        lambda s: replace(
+            s,
+            readings=tuple(
+                replace(r, conditions=Conditions(time=datetime(2025, 1, 6, 9, i, tzinfo=zone)))
+                for i, (r, zone) in enumerate(zip(s.readings, [UTC, UTC, None], strict=False))
+            ),
+        ),
+        "csv:4",
+        "expected all times of setup 'yx' with a time zone, or all without",
+    ),
     "repeated": (lambda s: first_reading(s, cycle=2), "csv", "repeats cycle 2"),
     "setup": (lambda s: first_reading(s, setup="xx"), "readings", "'xx' is not a setup"),
     "posture": (lambda s: first_reading(s, posture="p"), "readings", "'p' is not a posture"),

@@ -209,6 +209,7 @@ def test_a_plan_is_not_calibrated(root):
         (lambda: Tip("bal", 2e-3), "expected 'ball' or 'blade'"),
         (lambda: Gauge(sigma=0.0), "sigma: found 0.0; expected a positive number"),
         (lambda: Gauge(sigma=-1e-5), "sigma: found -1e-05"),
+        (lambda: Gauge(resolution=np.inf), "resolution: found inf; expected a positive number"),
         (lambda: Gauge(resolution=float("nan")), "resolution: found nan"),
     ],
 )

@@ -202,6 +202,9 @@ def test_base_parameters_and_a_weak_prior_predict_the_same_readings():
     assert np.sqrt(np.mean(np.square(gap))) < 0.4 * prior.sigma
     assert len(base.free) < 30
     assert base.noise.sigma == pytest.approx(5e-6, rel=0.15)
+    start = np.zeros(len(Choice("full").select(session.robot.parameters).names))
+    from_nominal, _ = identify(session, Choice("full", base=True), start=start, **QUICK)
+    assert from_nominal.rms_after == pytest.approx(base.rms_after, rel=1e-4)  # equal optimum
 
 
 def test_base_parameters_have_no_prior(raw_cycles):

@@ -84,6 +84,24 @@ def test_repeatability_solved_by_hand():
     assert sigma == pytest.approx(np.sqrt((1 + 1 + 4 + 4) / 2))
 
 
+@pytest.mark.parametrize("of_differences", [False, True])
+def test_the_repeatability_of_many_readings_needs_no_large_system(monkeypatch, of_differences):
+    """1000 postures with one zero twice, and 1000 zeros of differences between two postures."""
+    places, systems, solve = np.tile(np.arange(1000), 2), [], np.linalg.lstsq
+    monkeypatch.setattr(
+        np.linalg, "lstsq", lambda a, *rest, **kw: systems.append(a.shape) or solve(a, *rest, **kw)
+    )
+    one = np.repeat([0, 1], 1000) if of_differences else np.zeros_like(places)
+    o = observations(np.zeros_like(places), *((one, places) if of_differences else (places, one)))
+    values = np.random.default_rng(0).normal(size=(2, 1000))
+    values[1] += 3.0
+    sigma, dof = estimate_repeatability(values.reshape(-1), o)
+    differences = values[1] - values[0] - of_differences * (values[1] - values[0]).mean()
+    assert dof == 1000 - of_differences
+    assert sigma == pytest.approx(np.sqrt((differences**2).sum() / 2 / dof))
+    assert max(columns for _, columns in systems) <= 2
+
+
 def test_repeatability_of_differences_is_that_of_one_reading():
     plan = plan_of("raw-cycles")
     rows = [replace(r, minus="zero") for r in plan.readings if r.posture != "zero"]
@@ -274,6 +292,9 @@ def test_chance_of_equal_readings():
         stats.binom.sf(1, 3, single)
     )
     assert chance_of_equal_readings(9, 9, sigma=0.0, step=1e-5) == 1.0
+    assert chance_of_equal_readings(0, 9, sigma=5e-6, step=1e-5) == 1.0
+    many = chance_of_equal_readings(700, 2000, sigma=5e-6, step=1e-5)
+    assert many == pytest.approx(stats.binom.sf(699, 2000, single))
 
 
 def test_the_chance_of_an_excess_over_cycles_is_an_f_test():

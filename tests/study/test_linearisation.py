@@ -172,6 +172,16 @@ def test_session_and_other_errors(root):
     assert study.resolution == 10e-6
 
 
+def test_errors_are_those_that_active_offsets_do_not_correct(root):
+    """In the same postures. The linearisation point has the active offsets."""
+    session = load_plan(root / "examples/table1/experiment-2")
+    sessions = session, session.with_controller([3e-3, -2e-3, 1e-3])
+    studies = [build_linearisation_study(s, count=2, directions=2) for s in sessions]
+    one, other = (run_study(s).columns for s in studies)
+    for name in ("first_order", "reading_mm", "exact"):
+        assert other[name] == pytest.approx(one[name], abs=1e-9)
+
+
 def test_machines_without_contact_are_counted(root):
     """Large errors move the rod away from the ball of some gauge."""
     plan = load_plan(root / "examples/workshop/plan.yaml")

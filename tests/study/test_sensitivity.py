@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from effect_plans import effect_plan
 from machines import place
 
 from orthocal import load_plan
+from orthocal.effects.compensation import JointTrim
 from orthocal.errors import ClosureError, ParameterError, SessionError
-from orthocal.planning.first_plan import Displacements
+from orthocal.planning.first_plan import Displacements, build_paper_plan
+from orthocal.session.session import Gauge
 from orthocal.study.runner import run_study
 from orthocal.study.sensitivity import build_sensitivity_study, summarise_sensitivity
 
@@ -35,6 +39,25 @@ def test_each_approach_has_its_row():
         other = by_row.get((posture.replace("ppp", "nnn"), output))
         if "ppp" in posture and other is not None:
             assert row == pytest.approx(-other)
+
+
+def test_active_offsets_of_the_same_postures_change_no_derivative(orthoglide):
+    """The machine stops in the same places, whatever its controller adds."""
+    plan = build_paper_plan(orthoglide, Displacements(), Gauge(None, None, None))
+    plans = plan, plan.with_controller([5e-3, -5e-3, 10e-3])
+    studies = [build_sensitivity_study(p, ["*.offset"]) for p in plans]
+    one, other = (summarise_sensitivity(s, run_study(s)) for s in studies)
+    assert one.rows == other.rows
+    assert other.derivatives == pytest.approx(one.derivatives, abs=1e-8)
+
+
+def test_studies_with_other_tables_of_the_controller_are_others():
+    """Tables are in other files than the session.yaml."""
+    plan = effect_plan("backlash")
+    at = [[0.1, 0.0, 0.0], [0.3, 1.0, -1.0], [0.5, 0.0, 0.0]]
+    trims = [JointTrim(table=np.array(at) * [1.0, size, size]) for size in (1e-5, 2e-5)]
+    plans = (replace(plan, compensation=(t, *[JointTrim()] * 2)) for t in (*trims, trims[0]))
+    assert len({build_sensitivity_study(p, ["*.backlash"]).digest for p in plans}) == 2
 
 
 def test_points_are_read_with_the_conditions_of_each_setup():

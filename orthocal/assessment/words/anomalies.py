@@ -48,6 +48,10 @@ LEAST_CHANCE = 1e-4
 UNITS = {25.4: "in inches", 1e3: "in m", 1e-3: "in µm"}
 """Unit of wrongly written readings by the factor that corrects them; others are mm as inches."""
 
+BETWEEN_LOGS = "settings not entered", "settings interchanged", "bed moved"
+OF_BACKLASH = "backlash not entered", "backlash halved", "backlash entered twice"
+"""Kinds of anomalies that share a sentence."""
+
 
 def describe_anomalies(session: Session, result: Anomalies) -> list[Finding]:
     """Findings about all anomalies, and about readings that they do not explain."""
@@ -426,12 +430,8 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
         "offsets entered twice": lambda: _entered(e, "added twice"),
         "offsets interchanged": lambda: _entered(e, "interchanged"),
-        "settings not entered": lambda: _between_logs(e),
-        "settings interchanged": lambda: _between_logs(e),
-        "bed moved": lambda: _between_logs(e),
-        "backlash not entered": lambda: _compensated(session, e),
-        "backlash halved": lambda: _compensated(session, e),
-        "backlash entered twice": lambda: _compensated(session, e),
+        **dict.fromkeys(BETWEEN_LOGS, lambda: _between_logs(e)),
+        **dict.fromkeys(OF_BACKLASH, lambda: _compensated(session, e)),
     }
     return texts[e.kind]()
 

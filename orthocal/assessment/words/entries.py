@@ -10,11 +10,17 @@ import numpy as np
 from orthocal.assessment.controller_entries import ScrewEntry
 from orthocal.assessment.wording import counted, joined, note, parameter_places, tool_mm
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
-from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
+from orthocal.calibration.assessment_record import (
+    Assessment,
+    Finding,
+    ToolErrorSummary,
+    Verdict,
+)
 from orthocal.kinematics.conditions import StatedUse
 from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.robot.model import Drive, drive_keys
 from orthocal.session.session import Session
+from orthocal.text import capitalised
 from orthocal.units import UM, format_fixed
 
 HEADLINES: dict[Verdict, str] = {
@@ -150,6 +156,19 @@ def settings_change(*, tool: tuple[float, ...], layer: tuple[float, ...], keep: 
         layer_now_um=layer[0] / UM,
         layer_best_um=layer[1] / UM,
     )
+
+
+def find_settings_errors(assessment: Assessment) -> tuple[float, float]:
+    """Tool error with the present and with the best settings of a firmware, [m]; NaN if unknown."""
+    for finding in assessment.findings:
+        if "layer_now_um" in finding.numbers:
+            return finding.numbers["now_um"] * UM, finding.numbers["best_um"] * UM
+    return math.nan, math.nan
+
+
+def settings_unknown(reason: str) -> Finding:
+    """Finding that a calibration determines no settings of a firmware, with the reason."""
+    return note("settings unknown", f"{capitalised(reason)}.")
 
 
 def must_change(drives: Sequence[str]) -> Finding:

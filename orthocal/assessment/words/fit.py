@@ -23,13 +23,19 @@ MAX_LISTED = 6
 """Number of parameters above which they are not listed."""
 
 
-def noise_unknown() -> Finding:
-    """Finding that neither residuals nor the session determine the noise."""
+def noise_unknown(assumed: float) -> Finding:
+    """Finding that neither residuals nor the session determine the noise.
+
+    Args:
+        assumed: Standard deviation of a reading by which the values were estimated, [m].
+    """
     return note(
         "noise unknown",
         "There are as many parameters as readings, so these do not show the noise, and the session "
-        "does not state the noise of the gauge. The uncertainty is unknown.",
+        f"does not state the noise of the gauge. The values assume {mm(assumed)} mm. The "
+        "uncertainty is unknown.",
         "State the noise of each gauge (sigma_mm), or repeat the readings in cycles.",
+        sigma_mm=assumed / MM,
     )
 
 

@@ -68,11 +68,10 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
         zeros = np.zeros(count)
         return Diagnostics(np.full(count, np.nan), zeros, zeros.astype(np.int64), np.inf)
-    inverse = (
-        _weighted_information(fit)
-        .posterior(sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound)
-        .covariance
-    )
+    information = Information(_weighted_jacobian(fit)) if fit.loss.robust else fit.information
+    inverse = information.posterior(
+        sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
+    ).covariance
     weights, s_inv_x, m_y, s_inv_diagonal = _eliminate_zeros(fit)
     gain = s_inv_x @ inverse / sigma**2
     redundancy = s_inv_diagonal - weights * (gain * s_inv_x).sum(axis=1)
@@ -125,12 +124,10 @@ def _outlier_threshold(dof: float, count: int) -> float:
     return factor if factor < LARGEST_THRESHOLD else np.inf
 
 
-def _weighted_information(fit: Fit) -> Information:
-    """Information of the readings with the weights of a robust loss."""
-    if not fit.loss.robust:
-        return fit.information
+def _weighted_jacobian(fit: Fit) -> Array:
+    """Jacobian times roots of the robust weights, zeros eliminated, shape (n_entries, n_free)."""
     centred = project_out_zeros(fit.jacobian, fit.problem.observations, weights=fit.robust_weights)
-    return Information(np.sqrt(fit.robust_weights)[:, None] * centred)
+    return np.asarray(np.sqrt(fit.robust_weights)[:, None] * centred)
 
 
 def _inverse_covariance(o: Observations, group: Indices) -> Array | None:
@@ -186,9 +183,8 @@ def cross_validate_setups(fit: Fit) -> Array:
     setups = np.unique(o.setup)
     if setups.size < 2:
         return errors
-    root = np.sqrt(fit.robust_weights)[:, None]
-    factor = root * project_out_zeros(fit.jacobian, o, weights=fit.robust_weights)
-    weighted_residual = root[:, 0] * fit.residual / fit.sigma**2
+    factor = _weighted_jacobian(fit)
+    weighted_residual = np.sqrt(fit.robust_weights) * fit.residual / fit.sigma**2
     free = ~fit.at_bound
     precision = np.diag(problem.prior_precision)[np.ix_(free, free)]
     for setup in setups:

@@ -19,6 +19,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.subproblem import RANK_TOLERANCE, are_far, bounded_step
 from orthocal.estimation.solvers.variable_projection import VariableProjection, have_converged
+from orthocal.statistics.zeros import project_out_zeros
 
 MAX_STEPS = 30
 """Largest number of common iterations."""
@@ -150,13 +151,14 @@ class _BatchTask:
         self._incidence = problem.zero_incidence
         self._free_incidence = problem.zero_incidence * ~o.zero_known
         self.linear = problem.linearisation_at_active
-        self._jacobian = self._centre(self.linear.jacobian / sigma)
+        self._jacobian = project_out_zeros(self.linear.jacobian / sigma, o)
         normal = self._jacobian.T @ self._jacobian + np.diag(self._precision)
         self._inverse = np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True)
 
     def linearised_solutions(self, y: Array) -> Array:
         """Linearised solutions, clipped to the bounds, as start values θ̂, shape (S, n_free)."""
-        residual = self._centre(((y - self.linear.reading) / self.sigma).T).T
+        deviation = ((y - self.linear.reading) / self.sigma).T
+        residual = project_out_zeros(deviation, self.problem.observations).T
         gradient = residual @ self._jacobian - self._precision * (self.start - self._mean)
         return np.asarray(np.clip(self.start + gradient @ self._inverse, self.low, self.high))
 
@@ -240,8 +242,3 @@ class _BatchTask:
         objective = cost + 0.5 * (self._precision * (theta - self._mean) ** 2).sum(axis=1)
         good = np.isfinite(objective) & ~are_far(self.problem, theta)
         return zeros * self.sigma, objective, good
-
-    def _centre(self, values: Array) -> Array:
-        """Rows minus the mean of the rows with the same free zero, shape (n_entries, ...)."""
-        means = self._free_incidence.T @ values / self._counts[:, None]
-        return np.asarray(values - means[self.problem.observations.zero])

@@ -41,7 +41,7 @@ from orthocal.effects.loading import robot_effects
 from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.fields import read_only
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Drive, Robot
 from orthocal.units import UM
 
 NEGLIGIBLE = 0.1 * UM
@@ -64,6 +64,10 @@ class PeriodicErrors:
     """A, shape (n_drives,), [m]; 0 for drives without a periodic error."""
     cosine: Array
     """B, shape (n_drives,), [m]; 0 for drives without a periodic error."""
+
+    def of_drive(self, i: int) -> PeriodicErrors:
+        """Periodic errors of one drive, whose coordinates have any shape."""
+        return PeriodicErrors(self.lead, self.sine[i], self.cosine[i])
 
     def __call__(self, coordinates: ArrayLike) -> Array:
         """Errors at commanded coordinates, shape (..., n_drives), [m]."""
@@ -247,7 +251,7 @@ def tabulate(
                 "state them in the URDF"
             )
         travel = d.to_joint(np.array([d.lower, d.upper]) + offsets[i])
-        trims = _Trims(robot, i, offsets[i], 0.5 * joint.backlash, periodic)
+        trims = _Trims(d, offsets[i], 0.5 * joint.backlash, periodic.of_drive(i))
         tabulated.append(_tabulate_joint(joint, trims, np.sort(travel)))
     return tuple(tabulated)
 
@@ -256,6 +260,9 @@ def compensate_with_offsets(
     calibration: Calibration, latched: Sequence[int] | None = None
 ) -> tuple[JointCompensation, ...]:
     """Compensation to enter together with the offsets: BACKLASH, or a table that contains it.
+
+    Tables that are kept move with the display of their joints, so that the trim at each position of
+    the slide remains.
 
     Args:
         calibration: The calibration.
@@ -268,8 +275,18 @@ def compensate_with_offsets(
     """
     active = find_active_compensation(calibration, latched)
     compensation = find_compensation(calibration, latched)
-    compensation = tabulate(calibration, compensation, active, offsets_to_enter(calibration))
-    return round_backlash(compensation, active)
+    offsets = offsets_to_enter(calibration)
+    compensation = tabulate(calibration, compensation, active, offsets)
+    shifts = offsets - calibration.active_offsets
+    moved = []
+    for d, joint, old, shift in zip(
+        calibration.robot.drives, compensation, active, shifts.tolist(), strict=True
+    ):
+        if joint.table is not None and joint.table is old.table and shift:
+            positions = np.array([d.direction * shift, 0.0, 0.0])
+            joint = replace(joint, table=read_only(joint.table + positions))
+        moved.append(joint)
+    return round_backlash(moved, active)
 
 
 def compensate_with_module(
@@ -294,7 +311,8 @@ def compensate_with_module(
     for i, (joint, old) in enumerate(zip(compensation, active, strict=True)):
         half = 0.5 * joint.backlash
         if joint.table is None and old.table is not None:
-            trims = _Trims(robot, i, offsets[i], half, periodic, with_module=True)
+            of_drive = periodic and periodic.of_drive(i)
+            trims = _Trims(robot.drives[i], offsets[i], half, of_drive, with_module=True)
             table = _tabulate_joint(joint, trims, old.table[[0, -1], 0])
             compensated.append(replace(table, with_module=True))
         elif joint.table is None and periodic is not None:
@@ -309,9 +327,7 @@ def compensate_with_module(
 class _Trims:
     """Exact trims of a joint as a function of its position."""
 
-    robot: Robot
-    drive: int
-    """Index of the drive."""
+    drive: Drive
     offset: float
     """Offset in the controller, [m, rad]."""
     half: float
@@ -322,18 +338,16 @@ class _Trims:
 
     def __call__(self, joints: Array) -> Array:
         """Trims of both sides at positions (n,) of the joint, shape (n, 2), [m, rad]."""
-        drive, periodic = self.robot.drives[self.drive], self.periodic
-        commanded = np.tile(self.robot.drive_zero, (len(joints), 1))
-        commanded[:, self.drive] = drive.from_joint(joints) - self.offset
+        direction, periodic = self.drive.direction, self.periodic
+        commanded = self.drive.from_joint(joints) - self.offset
         target = commanded
         if self.with_module and periodic is not None:
             target = commanded + periodic(commanded)
         columns = []
         for side in (1.0, -1.0):
-            trimmed = np.array(target)
-            trimmed[:, self.drive] += drive.direction * side * self.half
+            trimmed = target + direction * side * self.half
             trimmed = trimmed if periodic is None else periodic.invert(trimmed)
-            columns.append(drive.direction * (trimmed - commanded)[:, self.drive])
+            columns.append(direction * (trimmed - commanded))
         return np.stack(columns, axis=1)
 
 

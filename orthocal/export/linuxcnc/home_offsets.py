@@ -74,9 +74,11 @@ class JointHome:
 
     @property
     def compensation_changes(self) -> bool:
-        """True if the controller's compensation is another one than during the measurement."""
+        """True if the compensation at a position of the slide differs from the measurement's."""
         new, old = self.compensation, self.was
-        return new.table is not old.table or abs(new.backlash - old.backlash) > SAME_POSITION
+        if new.table is None or old.table is None:
+            return new.table is not old.table or abs(new.backlash - old.backlash) > SAME_POSITION
+        return not np.array_equal(new.table[:, 1:], old.table[:, 1:])
 
     @property
     def counting(self) -> str:

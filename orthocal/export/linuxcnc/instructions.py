@@ -170,6 +170,10 @@ _IN_HOME_OFFSET = (
     "Half of the change of\nthe backlash is subtracted from HOME_OFFSET if HOME_LATCH_VEL is "
     "positive, and added if it is negative"
 )
+_MOVED_TABLES = (
+    "**Tables:** copy the files `joint_*.comp` beside your INI file. Tables that the calibration\n"
+    "does not change move with HOME_OFFSET, so that they still match the screws."
+)
 
 
 def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: bool = False) -> str:
@@ -207,8 +211,9 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
                 "\nThe signs + are assumed, because neither an INI file (`--ini FILE`) nor "
                 "`--latched` states them."
             )
-    tables = [h.compensation for h in homes if h.compensation.table is not h.was.table]
-    tables = [c for c in tables if c.table is not None]
+    with_table = [h for h in homes if h.compensation.table is not None]
+    written = [h for h in with_table if h.compensation.table is not h.was.table]
+    tables = [h.compensation for h in written if h.compensation_changes]
     if any(c.with_module for c in tables):
         paragraphs.append(
             "**Tables:** copy the files `joint_*_module.comp` beside your INI file. They replace\n"
@@ -220,6 +225,8 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
             "**Periodic error of the screws:** copy the files `joint_*.comp` beside your INI file."
             f"{_between_entries(tables)} A kinematics module\n(`--module`) corrects it exactly."
         )
+    if len(tables) < len(written):
+        paragraphs.append(_MOVED_TABLES)
     error = max((h.compensation.error for h in homes if h.compensation.table is None), default=0.0)
     if error > NEGLIGIBLE:
         paragraphs.append(

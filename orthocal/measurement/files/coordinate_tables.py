@@ -89,6 +89,7 @@ def format_rows(columns: dict[str, float], values: Array) -> str:
         values: Shape (K, n_columns), [SI].
     """
     scaled = values / np.array(list(columns.values()))
+    scaled[np.abs(scaled) < 0.5e-6] = 0.0  # not -0.000000
     empty = "," * (len(columns) - 1)
     return "".join(
         (",".join(f"{v:.6f}" for v in row) if np.isfinite(row).all() else empty) + "\n"

@@ -22,7 +22,7 @@ from orthocal.robot.model import Drive, Robot
 COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
 
-EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{(offsets_[^{}]*)\}$")
+EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{(offsets_[^{}]*)\}\r?$")
 """Comment of exported lines with the offsets of the drives (`drive_keys`)."""
 
 OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
@@ -63,7 +63,8 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         ParameterError: If a joint or a number is missing or wrong; names file and section.
         SessionError: If a COMP_FILE is wrong.
     """
-    sections = _read_sections(path)
+    text = read_text(path, error=ParameterError)
+    sections = _read_sections(text, path)
     trajectory = sections.get("TRAJ", {})
     joints = []
     for i, drive in enumerate(robot.drives):
@@ -85,7 +86,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         limits,
         tuple(latch or 1 for latch in latched) if stated else None,
         trims,
-        None if stated else _read_offsets(path, robot.drives),
+        None if stated else _read_offsets(text, robot.drives),
     )
 
 
@@ -100,12 +101,12 @@ def _require_unit(keys: Mapping[str, str], key: str, unit: str, where: str) -> N
         raise ParameterError(f"{key} is {stated}; expected {unit}", where=where)
 
 
-def _read_offsets(path: Path, drives: Sequence[Drive]) -> tuple[float, ...] | None:
+def _read_offsets(text: str, drives: Sequence[Drive]) -> tuple[float, ...] | None:
     """Offsets of the drives that a comment of exported lines states, [m, rad]; None without it."""
-    match = EXPORTED_OFFSETS.search(read_text(path, error=ParameterError))
+    match = EXPORTED_OFFSETS.search(text)
     stated = {} if match is None else dict(OFFSETS_OF_UNIT.findall(match[1]))
     try:
-        values = {unit: [float(v) for v in text.split(",")] for unit, text in stated.items()}
+        values = {unit: [float(v) for v in numbers.split(",")] for unit, numbers in stated.items()}
     except ValueError:
         return None
     names = [d.joint_unit for d in drives]
@@ -180,7 +181,7 @@ def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[flo
     return low * factor, high * factor
 
 
-def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
+def _read_sections(text: str, path: Path) -> Mapping[str, Mapping[str, str]]:
     """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC.
 
     Raises:
@@ -188,7 +189,6 @@ def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
     """
     sections = dict[str, dict[str, str]]()
     current = dict[str, str]()
-    text = read_text(path, error=ParameterError)
     for number, line in enumerate(text.splitlines(), start=1):
         if line.lstrip().startswith("#INCLUDE"):
             raise ParameterError(

@@ -8,7 +8,7 @@ another covariance has additional setups: `track[x2]`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -51,31 +51,28 @@ def split_points(session: Session) -> Session:
     return replace(session, setups=setups, gauges={n: gauges[n] for n in [*used, *gauges]})
 
 
-@dataclass
 class PointRows:
-    """Setups of the rows of a table, with additional ones for the covariances of rows."""
+    """Setups of the rows of a table, with additional ones for the covariances of rows.
 
-    session: Session
-    """The session as its files state it, with split setups of points."""
-    setups: dict[str, Setup] = field(default_factory=dict)
-    """All setups by name, additional ones included."""
-    gauges: dict[str, Gauge] = field(default_factory=dict)
-    """Their gauges by name."""
-    _setups_by_base: dict[str, list[str]] = field(default_factory=dict)
-    """Setups of points by base name."""
-    _setups_by_covariance: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
-    """Additional setups by base name and text of the covariance."""
+    Args:
+        session: The session as its files state it, with split setups of points.
+    """
 
-    def __post_init__(self) -> None:
-        self.setups, self.gauges = dict(self.session.setups), dict(self.session.gauges)
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.names = list(dict.fromkeys(map(base_name, session.setups)))
+        """Names of all setups as in the files."""
+        self.setups: dict[str, Setup] = dict(session.setups)
+        """All setups by name, additional ones included."""
+        self.gauges: dict[str, Gauge] = dict(session.gauges)
+        """Their gauges by name."""
+        self._setups_by_base: dict[str, list[str]] = {}
+        """Setups of points by base name."""
+        self._setups_by_covariance: dict[tuple[str, str], tuple[str, ...]] = {}
+        """Additional setups by base name and text of the covariance."""
         for name, setup in self.setups.items():
             if isinstance(setup.sensor, Points):
                 self._setups_by_base.setdefault(base_name(name), []).append(name)
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all setups as in the files."""
-        return list(dict.fromkeys(map(base_name, self.session.setups)))
 
     @property
     def has_points(self) -> bool:
@@ -185,6 +182,14 @@ def point_cells(
         numbers = (xx, yy, zz, xy, xz, yz)
         cells |= {c: f"{tidy(v / UM**2):.12g}" for c, v in zip(COVARIANCES, numbers, strict=True)}
     return cells
+
+
+def value_name(setup: str) -> str:
+    """Column of the readings of a setup, or principal axis of the covariance of its points."""
+    axis = setup.partition("[")[2][:1]
+    if axis.isdigit():
+        return f"the coordinate along principal axis {axis}"
+    return f"{axis or 'reading'}_mm"
 
 
 def is_of_row(name: str) -> bool:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
 from orthocal.kinematics.conditions import find_approach_problem
-from orthocal.measurement.files.point_rows import PointRows
+from orthocal.measurement.files.point_rows import PointRows, value_name
 from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, RawReading
 from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.observation.conditions import needed_conditions
@@ -23,6 +26,7 @@ from orthocal.sensors.protocol import (
     largest_reading,
     reads_pairs,
 )
+from orthocal.session.completeness import require_name
 from orthocal.session.differences import IndependentReadings
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten, spans
@@ -91,7 +95,9 @@ def _find_out_of_range(accepted: _AcceptedReadings, points: PointRows) -> dict[s
     errors: dict[str, SessionError] = {}
     values_mm: dict[str, list[float]] = {}
     for reading in accepted.readings:
-        values_mm.setdefault(reading.setup, []).append(reading.value / MM)
+        if reading.is_read:
+            values_mm.setdefault(reading.setup, []).append(reading.value / MM)
+    of_setup_mm = {setup: np.array(values) for setup, values in values_mm.items()}
     for reading, place in zip(accepted.readings, accepted.places, strict=True):
         setup = points.setups[reading.setup]
         try:
@@ -100,8 +106,9 @@ def _find_out_of_range(accepted: _AcceptedReadings, points: PointRows) -> dict[s
                 points.gauges[setup.gauge],
                 difference=is_difference(reading.minus, setup.sensor),
                 where=place,
+                name=value_name(reading.setup),
                 largest=largest_reading(setup.sensor),
-                of_setup_mm=values_mm[reading.setup],
+                of_setup_mm=of_setup_mm.get(reading.setup, ()),
             )
         except SessionError as e:
             errors.setdefault(place, e)
@@ -242,16 +249,6 @@ class _AcceptedReadings:
             )
 
 
-def require_name(name: str, names: Collection[str], noun: str, *, where: str) -> None:
-    """Refuse a name that the session does not have.
-
-    Raises:
-        SessionError: If the name is unknown; lists the names of the session.
-    """
-    if name not in names:
-        raise SessionError(f"'{name}' is not a {noun}; {noun}s: {', '.join(names)}", where=where)
-
-
 def _check_names(row: RawReading, session: Session, points: PointRows) -> None:
     """Refuse a setup or postures that the session does not have, and cells of other sensors."""
     require_name(row.setup, points.names, "setup", where=row.where)
@@ -389,8 +386,9 @@ def check_range(
     *,
     difference: bool,
     where: str,
+    name: str = "reading_mm",
     largest: float = LARGEST_READING,
-    of_setup_mm: Collection[float] = (),
+    of_setup_mm: ArrayLike = (),
 ) -> None:
     """Refuse a reading beyond the range of the gauge or of its kind of sensor. NaN passes.
 
@@ -399,6 +397,7 @@ def check_range(
         gauge: The gauge.
         difference: Whether the reading is a difference of two postures.
         where: File and line, or name of the reading, for messages.
+        name: Name of the value, for messages.
         largest: Largest reading of the kind of sensor, [m].
         of_setup_mm: Readings of the setup, [mm]. If most are in range, a larger reading may have a
             misplaced decimal point.
@@ -416,9 +415,10 @@ def check_range(
     if not beyond_sensor and not (value_mm < lowest or value_mm > highest):
         return
     ratio = abs(value_mm) / max(-lowest, highest)
-    n_in_range = sum(lowest <= v <= highest for v in of_setup_mm)
+    of_setup = np.asarray(of_setup_mm)
+    n_in_range = np.count_nonzero((lowest <= of_setup) & (of_setup <= highest))
     hint = UNIT_HINT if beyond_sensor or ratio > UNIT_HINT_RATIO else ""
-    if ratio > POINT_HINT_RATIO and 2 * n_in_range > len(of_setup_mm):
+    if ratio > POINT_HINT_RATIO and 2 * n_in_range > of_setup.size:
         hint = "; its decimal point may be misplaced"
     if beyond_sensor:
         expected = (
@@ -427,4 +427,4 @@ def check_range(
     else:
         kind = "a difference" if difference else "a reading"
         expected = f"the gauge's range allows {kind} from {lowest:g} to {highest:g}{hint}"
-    raise SessionError(f"reading_mm is {value_mm:g}; {expected}", where=where)
+    raise SessionError(f"{name} is {value_mm:g}; {expected}", where=where)

@@ -28,7 +28,7 @@ from orthocal.io.files import (
     require_plain_name,
 )
 from orthocal.measurement.files.point_rows import locate_stations, split_points
-from orthocal.measurement.files.readings_checks import check_readings, require_name, require_read
+from orthocal.measurement.files.readings_checks import check_readings, require_read
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.session_controller import (
     build_compensation,
@@ -53,6 +53,7 @@ from orthocal.sensors.protocol import (
     triple,
 )
 from orthocal.sensors.registry import read_setup
+from orthocal.session.completeness import require_name
 from orthocal.session.points import base_name
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
 from orthocal.text import list_some

@@ -204,7 +204,7 @@ def firmware_document(settings: DeltaSettings) -> dict[str, Any]:
     }
 
 
-def _tables(session: Session) -> dict[str, str]:
+def session_tables(session: Session) -> dict[str, str]:
     """Tables of trims of a session: text by file name."""
     drives = zip(session.robot.drives, session.compensation, strict=False)
     return {
@@ -259,7 +259,12 @@ def write_session(
     table = readings_table(
         session.readings, session.setups, decimals=decimals, blank=blank, needed=needed
     )
-    files = {"session.yaml": text, "readings.csv": table, **_tables(session), **(extra or {})}
+    files = {
+        "session.yaml": text,
+        "readings.csv": table,
+        **session_tables(session),
+        **(extra or {}),
+    }
     write_files(folder, files)
     return folder / "session.yaml"
 

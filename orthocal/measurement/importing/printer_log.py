@@ -134,12 +134,14 @@ def write_printer_import(result: PrinterImport, folder: str | Path) -> Path:
         Path of the session.yaml.
 
     Raises:
-        SessionError: If the directory contains a session already.
+        SessionError: If the directory contains a session or a robot already.
     """
     folder = Path(folder)
     for name in ("session.yaml", "readings.csv", ROBOT):
         if exists(folder / name):
             raise SessionError("exists already; choose another directory", where=str(folder / name))
+    if any(folder.glob("*.urdf")):
+        raise SessionError("is the directory of a robot; choose another one", where=str(folder))
     return write_session(result.session, folder)
 
 

@@ -25,6 +25,7 @@ from orthocal.measurement.files.coordinate_tables import stream_columns
 from orthocal.measurement.files.readings_file import COORDINATES
 from orthocal.measurement.motion.approach import name_approach
 from orthocal.robot.model import Robot, require_tcp
+from orthocal.session.completeness import require_name
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM
 
@@ -238,10 +239,7 @@ def bin_traces(session: Session, traces: Mapping[str, Trace]) -> dict[str, Binne
     """
     binned = {}
     for name, trace in traces.items():
-        if name not in session.setups:
-            raise SessionError(
-                f"'{name}' is not a setup; setups: {', '.join(session.setups)}", where="--trace"
-            )
+        require_name(name, session.setups, "setup", where="--trace")
         try:
             binned[name] = bin_trace(trace)
         except SessionError as e:

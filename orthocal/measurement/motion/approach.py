@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from orthocal.kinematics.conditions import ARROWS
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
-from orthocal.session.session import Conditions, Posture, Reading, Session
+from orthocal.session.session import Posture, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
 AS_ARROWS_SHOW = (
@@ -148,38 +147,9 @@ def possible_approaches(robot: Robot, postures: Mapping[str, Posture]) -> dict[s
     }
 
 
-def common_approach(robot: Robot, drives: Array) -> str | None:
-    """First usual approach that is possible in all postures; None if there is none.
-
-    Args:
-        robot: The robot.
-        drives: Nominal drive coordinates of the postures, shape (n, n_drives), [m, rad].
-    """
-    return next((a for a in usual_approaches(robot) if can_approach(robot, drives, a).all()), None)
-
-
 def fill_approach(robot: Robot, stated: str | None, other: str) -> str:
     """Stated approach with `other` in place of every u; `other` for all drives if unstated."""
     return (stated or "u" * len(robot.drives)).replace("u", other)
-
-
-def state_common_approach(session: Session) -> Session:
-    """Session in which readings without a stated approach get a common one, as in programs.
-
-    The session is unchanged if no effect depends on the approach, or if no common approach is
-    possible in all postures.
-    """
-    drives = np.array([p.drives for p in session.postures.values()]) + session.active_offsets
-    common = common_approach(session.robot, drives)
-    if common is None:
-        return session
-    readings = tuple(
-        replace(r, conditions=replace(r.conditions or Conditions(), approach=common))
-        if r.minus is None and r.approach is None
-        else r
-        for r in session.readings
-    )
-    return replace(session, readings=readings)
 
 
 def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:

@@ -12,7 +12,7 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.observations import drive_table
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.protocol import Contact, has_dial
 from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import MM
 
@@ -54,6 +54,8 @@ def guide(session: Session) -> Guidance:
     """
     robot = session.robot
     commanded = drive_table(session) + session.active_offsets
+    aligned_at = session.alignment_postures
+    alignment = tuple(Reading(setup, posture) for setup, posture in aligned_at.items())
     closure = nominal_closure(robot)
     passive = closure.close(commanded, names=list(session.postures))
     tool: dict[str, Array] = {}
@@ -63,15 +65,9 @@ def guide(session: Session) -> Guidance:
         joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
         passive=dict(zip(session.postures, passive, strict=True)),
         tool=tool,
-        contacts=locate_contacts(with_alignment(session)),
-        aligned_at=session.alignment_postures,
+        contacts=locate_contacts(replace(session, readings=(*session.readings, *alignment))),
+        aligned_at=aligned_at,
     )
-
-
-def with_alignment(session: Session) -> Session:
-    """Session with an additional reading of each setup in its alignment posture."""
-    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
-    return replace(session, readings=(*session.readings, *extra))
 
 
 def dial_zero(gauge: Gauge) -> str:
@@ -93,9 +89,12 @@ def range_of_expected(gauge: Gauge, *, differences: bool) -> tuple[float, float]
 
 def set_dial(session: Session, setup: str) -> str:
     """Instruction for setting the gauge zero of a setup."""
-    gauge = session.gauges[session.setups[setup].gauge]
-    if session.setups[setup].zero == "known":
+    of_setup = session.setups[setup]
+    gauge = session.gauges[of_setup.gauge]
+    if of_setup.zero == "known":
         return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
+    if not has_dial(of_setup.sensor):
+        return "The gauge zero is not set: the calibration estimates it."
     travel = ""
     if gauge.range is not None:
         travel = f", about {gauge.half_range / MM:g} mm"

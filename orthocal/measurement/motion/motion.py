@@ -11,7 +11,8 @@ conditions: the drives reach it, the tip stays on the rod, and the dial stays in
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -19,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, SessionError, UnreachablePathError
+from orthocal.errors import ClosureError, OrthocalError, SessionError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
@@ -172,15 +173,8 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    first = {setup: rows[0][1] for setup, rows in rows_by_setup.items()}
     guided = _guided_setups(session)
-    additional_alignments = {
-        aligned_at[s]
-        for s, r in first.items()
-        if s not in guided and aligned_at[s] != (r.minus or r.posture)
-    }
-    unguided = [r for r in session.readings if r.setup not in guided]
-    stop_at = _find_approaches(session, unguided, additional_alignments) if unguided else {}
+    stop_at = _find_approaches(session, _unguided_places(session, guided))
     motions = []
     for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
         if setup in guided:
@@ -194,6 +188,46 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows_by_setup), alignment, tuple(stops)))
     return tuple(motions)
+
+
+def common_approach(session: Session) -> str | None:
+    """Approach of programs in postures without a stated one; None if no common one is possible.
+
+    It is also None if no effect of the machine depends on the approach.
+    """
+    places = _unguided_places(session, _guided_setups(session))
+    if not places or not usual_approaches(session.robot):
+        return None
+    for letter in "pn":
+        if _free_failure(_begin_approaches(session, places, letter)[1]) is None:
+            return letter * len(session.robot.drives)
+    return None
+
+
+def state_program_approaches(session: Session) -> Session:
+    """Session in which readings without a stated approach get that of programs, if possible."""
+    guided = _guided_setups(session)
+    if any(r.setup in guided and r.approach is None for r in session.readings):
+        with suppress(OrthocalError):  # no program can be made
+            session = state_path_approaches(session)
+    common = common_approach(session)
+    return _with_approaches(session, lambda _, r: r.approach or common)
+
+
+def _with_approaches(session: Session, find: Callable[[int, Reading], str | None]) -> Session:
+    """Session whose readings in one posture have other approaches.
+
+    Args:
+        session: The session.
+        find: Function from the index of a reading and the reading to its approach; None for the
+            stated one.
+    """
+    readings = list(session.readings)
+    for i, r in enumerate(readings):
+        if r.minus is None and (approach := find(i, r)) not in (None, r.approach):
+            conditions = replace(r.conditions or Conditions(), approach=approach)
+            readings[i] = replace(r, conditions=conditions)
+    return replace(session, readings=tuple(readings))
 
 
 def _refuse_pairs(session: Session) -> None:
@@ -223,27 +257,24 @@ def state_path_approaches(session: Session) -> Session:
     guided = _guided_setups(session)
     if not guided or not usual_approaches(session.robot):
         return session
-    approaches = {
-        (m.setup, stop.line): stop.approach
-        for m in plan_motion(session)
-        if m.setup in guided
-        for stop in m.stops
+    rows = enumerate(session.readings)
+    of_guided = tuple(replace(r, line=i) for i, r in rows if r.setup in guided)
+    approach_by_row = {
+        stop.line: stop.approach
+        for motion in plan_motion(replace(session, readings=of_guided))
+        for stop in motion.stops
         if stop.role == "reading"
     }
-    readings = tuple(
-        replace(r, conditions=replace(r.conditions or Conditions(), approach=approaches[key]))
-        if (key := (r.setup, i + FIRST_LINE if r.line is None else r.line)) in approaches
-        else r
-        for i, r in enumerate(session.readings)
-    )
-    return replace(session, readings=readings)
+    return _with_approaches(session, lambda i, _: approach_by_row.get(i))
 
 
 Path = Callable[[Array, Array], Array]
 """Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
 
-Approaches = dict[tuple[str, str | None], Stop]
-"""Stops by posture and stated approach, which is None if not stated."""
+Place = tuple[str, str | None]
+"""Posture and stated approach, which is None if not stated."""
+
+Approaches = dict[Place, Stop]
 
 
 def _guided_setups(session: Session) -> dict[str, Path]:
@@ -302,9 +333,20 @@ def _stops_on_path(session: Session, setup: str) -> Approaches:
     return stops
 
 
-def _find_approaches(
-    session: Session, readings: Sequence[Reading], alignment: set[str]
-) -> Approaches:
+def _unguided_places(session: Session, guided: Collection[str]) -> list[Place]:
+    """Postures to read or to align a gauge, with stated approaches, of setups without a path."""
+    ordered = (session.readings[i] for i in order_of_measurement(session.readings))
+    unguided = [r for r in ordered if r.setup not in guided]
+    first = {r.setup: r.minus or r.posture for r in reversed(unguided)}
+    aligned_at = session.alignment_postures
+    places: set[Place] = {(aligned_at[s], None) for s, p in first.items() if aligned_at[s] != p}
+    places |= {(r.posture, r.approach) for r in unguided}
+    places |= {(r.minus, None) for r in unguided if r.minus is not None}
+    order = {name: i for i, name in enumerate(session.postures)}
+    return sorted(places, key=lambda place: (order[place[0]], place[1] or ""))
+
+
+def _find_approaches(session: Session, places: Sequence[Place]) -> Approaches:
     """Stops to read or to align a gauge, each at the end of its approach.
 
     Postures without a stated approach are all approached from one side. The same side applies to
@@ -312,22 +354,18 @@ def _find_approaches(
 
     Args:
         session: The session.
-        readings: The readings to approach.
-        alignment: Names of the alignment postures.
+        places: Postures and stated approaches.
 
     Raises:
         SessionError: If neither side is possible in all these postures, or a posture cannot be
             approached as stated.
     """
-    wanted: set[tuple[str, str | None]] = {(name, None) for name in alignment}
-    wanted |= {(r.posture, r.approach) for r in readings}
-    wanted |= {(r.minus, None) for r in readings if r.minus is not None}
-    order = {name: i for i, name in enumerate(session.postures)}
-    places = sorted(wanted, key=lambda place: (order[place[0]], place[1] or ""))
+    if not places:
+        return {}
     refused: list[ClosureError] = []
     for letter in "pn":
         stops, failures = _begin_approaches(session, places, letter)
-        first = next((e for (_, s), e in failures.items() if s is None or "u" in s), None)
+        first = _free_failure(failures)
         if first is not None:
             refused.append(first)
             continue
@@ -345,9 +383,14 @@ def _find_approaches(
     )
 
 
+def _free_failure(failures: Mapping[Place, ClosureError]) -> ClosureError | None:
+    """First error of a place where the side of a drive is not stated; None without one."""
+    return next((e for (_, stated), e in failures.items() if "u" in (stated or "u")), None)
+
+
 def _begin_approaches(
-    session: Session, places: Sequence[tuple[str, str | None]], letter: str
-) -> tuple[Approaches, dict[tuple[str, str | None], ClosureError]]:
+    session: Session, places: Sequence[Place], letter: str
+) -> tuple[Approaches, dict[Place, ClosureError]]:
     """Stops of postures with their approaches.
 
     Args:
@@ -610,6 +653,7 @@ def _predict(
         )
     )
     _, contact = locate_contacts(sampled)[setup]
+    sensor = sampled.setups[setup].sensor
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
     gauge, differences = sampled.gauges[sampled.setups[setup].gauge], stops[first].role != "reading"
@@ -621,7 +665,7 @@ def _predict(
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
-        if i > 0:  # the gauge is mounted at the first stop
+        if i > 0 and has_dial(sensor):  # the gauge is mounted at the first stop
             start = end - len(paths[i].points)
             on_path = predicted[start:end]
             problems = [p for p in contact.problems[start:end] if p]

@@ -27,7 +27,7 @@ from orthocal.measurement.motion.motion import SetupMotion, Stop
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import BallIndicator
-from orthocal.sensors.protocol import Sensor, mounting_steps
+from orthocal.sensors.protocol import Sensor, has_dial, mounting_steps
 from orthocal.session.session import Session
 from orthocal.text import comment_safe, shorten
 from orthocal.units import MM, format_fixed
@@ -148,7 +148,7 @@ def write_program(
         )
     name, setup = (comment_safe(text, LONGEST_NAME) for text in (robot.name, motion.setup))
     of_setup = session.setups[motion.setup]
-    sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
+    sensor = of_setup.sensor
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     stated = any(r.approach for r in session.readings)
     lines = [
@@ -166,9 +166,7 @@ def write_program(
     ]
     mount = _mount(sensor, session.distinguish_gauge(of_setup.gauge))
     for i, stop in enumerate(stops):
-        zero = "0" if stop.role == "subtracted" else ""
-        if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
-            zero = dial_zero(gauge)
+        zero = _zero_to_set(session, motion, stop)
         actions = (
             mount if i == 0 else "",
             f"set the dial to {zero}" if zero else "",
@@ -225,6 +223,17 @@ def _mount(sensor: Sensor, name: str) -> str:
         return f"mount {gauge} as the sheet shows"
     align = "align its ball as the sheet shows" if isinstance(sensor, BallIndicator) else "align it"
     return f"mount {gauge}, {align}"
+
+
+def _zero_to_set(session: Session, motion: SetupMotion, stop: Stop) -> str:
+    """Reading to which the dial is set at a stop, in mm; empty if it is not set there."""
+    setup = session.setups[motion.setup]
+    if not has_dial(setup.sensor):
+        return ""
+    if stop.role == "subtracted":
+        return "0"
+    is_first = stop is motion.stops[0] and setup.zero == "free"
+    return dial_zero(session.gauges[setup.gauge]) if is_first else ""
 
 
 def _end(sensor: Sensor) -> str:

@@ -341,7 +341,7 @@ def _across(gauge: GaugePosition) -> str:
 
 def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
     """Instruction for setting the gauge zero."""
-    if setup.zero == "known":
+    if setup.zero == "known" or not has_dial(setup.sensor):
         return set_dial(session, setup.name)
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (

@@ -239,7 +239,7 @@ def _next_step(
     firmware = calibration.session.firmware
     if firmware is not None:
         if unchanged:
-            return PRINT, ()
+            return "none." if assessment.of_kind("settings unknown") else PRINT, ()
         directory, new = (quote_path(p) for p in (saved, f"{saved}-{firmware.firmware}"))
         return "write settings for the firmware; its README says what to expect.", (
             f"orthocal export {directory} --to {firmware.firmware} --out {new}",

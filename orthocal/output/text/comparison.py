@@ -11,7 +11,7 @@ from rich.text import Text
 from orthocal.assessment.comparison import Comparison
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.anomalies import describe_evidence
-from orthocal.assessment.words.entries import describe_region
+from orthocal.assessment.words.entries import describe_region, find_settings_errors
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import STYLES, render_decision
 from orthocal.output.text.layout import (
@@ -84,16 +84,19 @@ def render_comparison(
 
 def _tool_errors(comparison: Comparison) -> RenderableType:
     """Expected tool errors of each model, as `calibrate` states them for it."""
-    rows = []
+    rows, entering = [], "offsets"
     for result, assessed in zip(comparison.results, comparison.assessments, strict=True):
         tool, only = assessed.tool, result.calibration.only_offsets
         if tool is None:
             rows.append((result.model, "unknown", "", ""))
             continue
         corrected = "" if only else tool_mm(tool.compensated)
-        rows.append((result.model, tool_mm(tool.now), tool_mm(tool.entered), corrected))
+        now, entered = tool.now, tool.entered
+        if result.calibration.session.firmware is not None:
+            now, entered, entering = *find_settings_errors(assessed), "settings"
+        rows.append((result.model, tool_mm(now), tool_mm(entered), corrected))
     rows += [(u.model, "not identifiable", "", "") for u in comparison.undetermined]
-    headers = ("model", "tool error now", "with its offsets", "identified errors corrected")
+    headers = ("model", "tool error now", f"with its {entering}", "identified errors corrected")
     regions = dict.fromkeys(describe_region(a.tool) for a in comparison.assessments if a.tool)
     return noted(table_of(headers, rows), *regions)
 

@@ -19,16 +19,14 @@ from orthocal.measurement.motion.approach import (
     AS_ARROWS_SHOW,
     FROM_ONE_SIDE,
     approach_length,
-    common_approach,
     describe_approach,
     fill_approach,
     label_reading,
 )
 from orthocal.measurement.motion.guidance import guide, set_dial
-from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.motion.motion import common_approach, plan_motion
 from orthocal.measurement.recorded_rows import RecordedReading
 from orthocal.measurement.recording import Recording
-from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.output.text.answer import calibrate_command
 from orthocal.robot.model import drive_keys, name_coordinates
@@ -79,10 +77,7 @@ class RecordingText:
     @property
     def programmed_approach(self) -> str:
         """Approach of a program whose plan states none."""
-        robot, drives = self._session.robot, drive_table(self._session)
-        return common_approach(robot, drives + self._session.active_offsets) or fill_approach(
-            robot, None, "p"
-        )
+        return common_approach(self._session) or fill_approach(self._session.robot, None, "p")
 
     def question(self, condition: str, temperature: float | None, approach: str) -> str:
         """Question for a condition of the next readings.
