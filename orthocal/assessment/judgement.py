@@ -358,7 +358,11 @@ def _describe_order(session: Session) -> list[Finding]:
         return []
     times = model.times
     later = bool(times) and times[last] > times[model.labels[-1]]
-    return [describe_wrong_order(model.labels[-1], last, timed=later)]
+    return [
+        describe_wrong_order(
+            model.labels[-1], last, timed=later, firmware=session.firmware is not None
+        )
+    ]
 
 
 def _describe_detectable(session: Session) -> Finding:

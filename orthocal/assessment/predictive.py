@@ -21,7 +21,12 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import GaugeRecord
-from orthocal.calibration.refit import restore_mounting_covariance
+from orthocal.calibration.refit import (
+    calibrated_theta,
+    known_parameters,
+    restore_covariances,
+    restore_mounting_covariance,
+)
 from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
@@ -82,7 +87,8 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
     if not (np.all(noise.sigma > 0.0) and noise.dof > 0.0 and dof > 0):
         return DeviationTest(math.nan, math.nan)
     root = _root_of_covariance(calibration, fit)
-    centre = np.append([p.value for p in calibration.free], problem.prior_mean[problem.n_machine :])
+    centre, known = problem.prior_mean.copy(), known_parameters(calibration, problem)[0]
+    centre[known] = calibrated_theta(calibration, fit)[known]
     square, worst_setup = _least_square(fit, centre, root, noise.sigma)
 
     def p_value(factor: float) -> float:
@@ -107,8 +113,12 @@ def _root_of_covariance(calibration: Calibration, fit: Fit) -> Array:
     """
     problem, n = fit.problem, fit.problem.n_machine
     covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
-    scale = problem.theta_scale[:n]
-    covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(scale, scale)
+    here, there = known_parameters(calibration, problem)
+    known = calibration.model_covariance
+    if here.size > n:
+        known = restore_covariances(calibration)[0][np.ix_(there, there)]
+    scale = problem.theta_scale[here]
+    covariance[np.ix_(here, here)] = np.nan_to_num(known) / np.outer(scale, scale)
     return square_root(covariance)
 
 
@@ -298,16 +308,17 @@ def _expect_with_priors(calibration: Calibration, fit: Fit, noise: Array) -> Exp
     """
     if not np.all(noise > 0.0):
         return ExpectedDeviations(math.nan, math.nan)
-    problem, n = fit.problem, fit.problem.n_machine
+    problem = fit.problem
     o, precision = problem.observations, problem.prior_precision
     along = project_out_zeros(fit.jacobian * (problem.noise_ratio / noise)[:, None], o)
     information = along.T @ along
-    mounting = along[:, n:] @ np.linalg.inv(information + np.diag(precision))[n:]
-    calibrated = np.array([p.value for p in calibration.free])
-    from_mean = (calibrated - problem.prior_mean[:n]) / problem.theta_scale[:n]
+    determined, _ = known_parameters(calibration, problem)
+    new = np.setdiff1d(np.arange(problem.n_free), determined)
+    mounting = along[:, new] @ np.linalg.inv(information + np.diag(precision))[new]
+    from_mean = (calibrated_theta(calibration, fit) - problem.prior_mean) / problem.theta_scale
     by_errors = mounting * precision
-    known = by_errors[:, :n] @ from_mean
-    by_errors[:, :n] += along[:, :n]
+    known = by_errors[:, determined] @ from_mean[determined]
+    by_errors[:, determined] += along[:, determined]
     by_errors = by_errors @ _root_of_covariance(calibration, fit)
 
     def rows(entries: Array) -> Array:

@@ -30,6 +30,7 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, box_workspace
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.printers.settings import DeltaSettings, FirmwareName
+from orthocal.session.session import split_label
 from orthocal.units import DEG, MM
 
 FIRST_LAYER = 10.0
@@ -379,8 +380,14 @@ def _bed_tilt(calibration: Calibration, bed: str) -> Array:
     from scipy.spatial.transform import Rotation
 
     values = {p.name: p.value for p in calibration.sensors}
-    yaw, roll = (values.get(f"setup.{bed}.{k}", 0.0) for k in ("yaw", "roll"))
+    yaw, roll = (values.get(name, 0.0) for name in _tilt_names(calibration, bed))
     return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
+
+
+def _tilt_names(calibration: Calibration, bed: str) -> tuple[str, str]:
+    """Names of yaw and roll of the bed, which joined logs share."""
+    _, shared = split_label(bed, joined=bool(calibration.session.parts))
+    return f"setup.{shared}.yaw", f"setup.{shared}.roll"
 
 
 def _bed_rotation_derivative(calibration: Calibration, bed: str) -> Array:
@@ -389,7 +396,8 @@ def _bed_rotation_derivative(calibration: Calibration, bed: str) -> Array:
     Element i, j, k: change of coordinate i of a point per unit of coordinate j and parameter k.
     """
     derivative = np.zeros((3, 3, len(calibration.sensors)))
-    axes = {f"setup.{bed}.roll": [1.0, 0.0, 0.0], f"setup.{bed}.yaw": [0.0, 1.0, 0.0]}
+    yaw, roll = _tilt_names(calibration, bed)
+    axes = {roll: [1.0, 0.0, 0.0], yaw: [0.0, 1.0, 0.0]}
     for k, parameter in enumerate(calibration.sensors):
         if parameter.name in axes:
             derivative[:, :, k] = np.cross(axes[parameter.name], np.eye(3)).T

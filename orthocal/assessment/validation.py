@@ -14,8 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from orthocal.assessment.assess import assess, assessment_of, is_significant
 from orthocal.assessment.controller_entries import (
     compensation_to_enter,
@@ -50,7 +48,7 @@ from orthocal.calibration.assessment_record import (
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.calibration.recorded_robot import require_calibrated_robot
-from orthocal.calibration.refit import repeat_fit, restore_session
+from orthocal.calibration.refit import calibrated_theta, repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
@@ -333,7 +331,7 @@ def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration
     The nominal readings of the calibration are the predicted ones.
     """
     fit = repeat_fit(calibration, session)
-    return fit, assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    return fit, assemble_calibration(fit, nominal=calibrated_theta(calibration, fit))
 
 
 def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:

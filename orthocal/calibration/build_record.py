@@ -59,8 +59,8 @@ def assemble_calibration(
     Args:
         fit: The solved problem.
         full_problem: The problem with all parameters, if base parameters were estimated.
-        nominal: Free parameters of the machine that predicts the nominal readings, shape
-            (n_machine,), [SI]; by default the nominal machine with the active offsets.
+        nominal: Parameters that predict the nominal readings, shape (n_free,), [SI]; by default
+            those of the nominal machine with the active offsets and the estimated mountings.
 
     Raises:
         SolverError: If an estimate is not a plausible number.
@@ -318,11 +318,10 @@ def _residual_rows(
         )
         return session.values - row_noise * observations.rows(residual)
 
-    mountings = fit.solution.theta[problem.n_machine :]  # of the calibrated machine
     if nominal_theta is None:
-        nominal = fitted(problem.predict_nominal(mountings))
+        nominal = fitted(problem.predict_nominal(fit.solution.theta[problem.n_machine :]))
     else:
-        nominal = fitted(problem.predict(np.append(nominal_theta, mountings), None))
+        nominal = fitted(problem.predict(nominal_theta, None))
     try:
         passive = problem.close(fit.linearised_theta, start=fit.solution.passive)
         by_linear = fitted(problem.predict(fit.linearised_theta, passive))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arguments import require_kind
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.fit import Fit, find_mounting_covariance, fit_problem
@@ -22,6 +22,7 @@ from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.observation.gauge_noise import SMALLEST_SIGMA
+from orthocal.observation.sensor_groups import fixed_parameters
 from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.statistics.information import Information, decompose
 
@@ -40,9 +41,34 @@ def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Give
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
-    session = join_sessions(gather_sessions(sessions))
-    nominal = np.array([p.value for p in calibration.free])
-    return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
+    fit = repeat_fit(calibration, join_sessions(gather_sessions(sessions)))
+    return assemble_calibration(fit, nominal=calibrated_theta(calibration, fit))
+
+
+def calibrated_theta(calibration: Calibration, fit: Fit) -> Array:
+    """Calibrated parameters with the mountings of a fit to new readings, shape (n_free,), [SI]."""
+    theta = fit.solution.theta.copy()
+    here, there = known_parameters(calibration, fit.problem)
+    theta[here] = np.array([p.value for p in (*calibration.free, *calibration.sensors)])[there]
+    return theta
+
+
+def known_parameters(
+    calibration: Calibration, problem: CalibrationProblem
+) -> tuple[Indices, Indices]:
+    """Parameters of new readings that a calibration of the same parameters has determined.
+
+    They are those of the machine, and of a printer those of its bed. Mountings are new.
+
+    Returns:
+        Indices among the parameters of the problem, and among the free parameters and the nuisance
+        parameters of the calibration.
+    """
+    n = problem.n_machine
+    place = {p.name: n + i for i, p in enumerate(calibration.sensors)}
+    fixed = fixed_parameters(problem.session) & place.keys()
+    here = [*range(n), *(i for i in range(n, problem.n_free) if problem.free[i] in fixed)]
+    return np.array(here), np.array([*range(n), *(place[problem.free[i]] for i in here[n:])])
 
 
 def repeat_fit(

@@ -94,11 +94,20 @@ def require_not_calibrated(
         other = replace(
             part,
             path=None if record.path is None else Path(record.path),
+            postures=_own_postures(part),
             readings=tuple(_without_label(r, joined=part.joined) for r in part.readings),
         )
         for session in sessions:
             if not session.was_read_from(record.sha256):  # `validate_calibration` refuses it
                 _require_measured_again(session, other)
+
+
+def _own_postures(part: orthocal.Session) -> dict[str, orthocal.Posture]:
+    """Postures of a part of a session, with their names in its own session."""
+    from orthocal.session.session import split_label
+
+    names = {name: split_label(name, joined=part.joined) for name in part.postures}
+    return {names[n][1]: p for n, p in part.postures.items() if names[n][0] in part.labels}
 
 
 def _without_label(reading: orthocal.Reading, *, joined: bool) -> orthocal.Reading:

@@ -36,6 +36,9 @@ AnomalyKind = Literal[
     "backlash not entered",
     "backlash halved",
     "backlash entered twice",
+    "settings not entered",
+    "settings interchanged",
+    "bed moved",
     "machine changed",
     "lost steps",
 ]
@@ -86,7 +89,8 @@ class Explanation:
     names: tuple[str, ...] = ()
     """Legs, gauges or postures that the scope refers to; a displaced artefact; the key of a wrong
     dimension and its stated value in mm. `readjusted dimension`: also the first session with the
-    other value."""
+    other value. `settings not entered`, `settings interchanged`: settings of a firmware; empty if
+    all of them are concerned."""
     cycle: int | None = None
     """The cycle, if only one is concerned."""
     factor: float | None = None

@@ -11,6 +11,7 @@ from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.lost_steps import lost_steps
+from orthocal.hypotheses.families.printer_settings import changes_between_logs
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.sessions import changes_between_sessions
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
@@ -34,7 +35,8 @@ REFIT_LOG_BAYES = 4.0
 """Smallest log Bayes factor, to first order, of hypotheses that are relinearised."""
 
 N_FAMILIES = 34.0
-"""Number of families that share the prior probability; each effect is as likely as a family."""
+"""Number of families that share the prior probability; each effect is as likely as a family.
+Settings of a printer take the place of offsets in a controller."""
 
 MAX_REFITTED = 8
 """Most single hypotheses that are relinearised in each step."""
@@ -281,6 +283,7 @@ def list_families(model: LinearModel, rows: Rows, *, grouped: bool) -> Iterator[
     yield from swapped_rows(rows)
     yield from row_offsets(rows)
     yield from changes_between_sessions(model)
+    yield from changes_between_logs(model)
     yield from lost_steps(model, rows)
 
 

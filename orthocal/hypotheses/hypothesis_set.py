@@ -89,7 +89,9 @@ class HypothesisSet:
 
 
 def _count_drives(e: Explanation) -> int:
-    """Drives with wrong numbers: 0 if all drives have them, 2 if the number is unknown."""
+    """Drives or settings with wrong numbers: 0 if all have them, 2 if the number is unknown."""
+    if e.names and not e.rows:  # settings of a printer
+        return len(e.names)
     if e.active:
         return 0 if len(e.drives) == len(e.active) else len(e.drives)
     return 2 if e.parameters and not e.rows else 0

@@ -28,6 +28,7 @@ from orthocal.hypotheses.hypothesis import (
 )
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
+from orthocal.measurement.joining import settings_of_sessions
 from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.session.session import Session, split_label
@@ -211,9 +212,11 @@ class LinearModel:
 
         The times of the readings determine the order if all readings state them. Without times, or
         at equal times, sessions whose controller corrects nothing come first; all others have the
-        order in which they were joined.
+        order in which they were joined. A printer corrects something by settings of single towers.
         """
+        settings = settings_of_sessions(self.problem.session)
         corrected = np.abs(np.hstack([self.active, self.compensated])).max(axis=1) > 0.0
+        corrected |= [n in settings and settings[n].corrects_towers for n in self.labels]
         times = self.times or dict.fromkeys(self.labels, datetime.min.replace(tzinfo=UTC))
         keys = [(times[n], c) for n, c in zip(self.labels, corrected.tolist(), strict=True)]
         return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))

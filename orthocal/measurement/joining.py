@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
@@ -16,6 +17,7 @@ from orthocal.effects.adjustment import subtract_amounts
 from orthocal.effects.loading import with_adjustments
 from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
+from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, Session, Setup, split_label
 from orthocal.text import composed
@@ -228,6 +230,33 @@ def split_sessions(session: Session) -> tuple[Session, ...]:
             )
         )
     return tuple(parts)
+
+
+def settings_of_sessions(session: Session) -> dict[str, DeltaSettings]:
+    """Stated settings of joined sessions by label, in the coordinates of the joined session.
+
+    Those of a session that was joined before and has no parts are unknown, except of its last one.
+    """
+    if session.firmware is None:
+        return {}
+    settings = _list_settings(session)
+    labels = list(dict.fromkeys(session.labels))
+    if len(settings) != len(labels):
+        return {}
+    homed = np.array(session.firmware.homed)
+    return {
+        label: s.moved(homed - s.homed)
+        for label, s in zip(labels, settings, strict=True)
+        if s is not None
+    }
+
+
+def _list_settings(session: Session) -> list[DeltaSettings | None]:
+    """Stated settings of the sessions of which a session consists."""
+    if session.joined and session.parts:
+        return [s for part in session.parts for s in _list_settings(part)]
+    unknown = len(set(session.labels)) - 1
+    return [*[None] * unknown, session.firmware]
 
 
 def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:

@@ -126,7 +126,21 @@ def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
     if parameter.shared_by is not None:
         label, _ = split_label(setup.name, joined=session.joined)
         return f"{label}/{parameter.shared_by}" if label else parameter.shared_by
+    if parameter.fixed and session.firmware is not None:
+        return f"setup.{split_label(setup.name, joined=session.joined)[1]}"
     return f"setup.{setup.name}"
+
+
+def fixed_parameters(session: Session) -> set[str]:
+    """Nuisance parameters of parts of a printer, which all its logs share."""
+    if session.firmware is None:
+        return set()
+    return {
+        f"{_owner(p, setup, session)}.{p.name}"
+        for setup in session.setups.values()
+        for p in setup.sensor.nuisance_parameters
+        if p.fixed
+    }
 
 
 def _shared_gauge(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:

@@ -35,6 +35,9 @@ Three: TypeAlias = tuple[Number, Number, Number]
 DESIGN_ANGLES = (210 * DEG, 330 * DEG, 90 * DEG)
 """Nominal directions of the towers a, b and c, [rad]."""
 
+EQUAL = 1e-9
+"""Largest difference of equal settings, [m, rad]."""
+
 MAX_TOWER_ANGLE = 10 * DEG
 """Largest deviation of a tower from its nominal direction, [rad]."""
 
@@ -79,6 +82,12 @@ class DeltaSettings:
     def middle(self) -> Array:
         """Coordinates of the carriages with the nozzle at 0, shape (3,), [m]."""
         return np.sqrt(np.array(self.rods) ** 2 - self.radius**2) + self.shift
+
+    @property
+    def corrects_towers(self) -> bool:
+        """True if rods, endstops or angles between the towers differ, unlike those of a design."""
+        turned = np.subtract(self.angles, DESIGN_ANGLES)
+        return any(float(np.ptp(v)) > EQUAL for v in (self.rods, turned, self.endstops))
 
     @property
     def endstops(self) -> Array:

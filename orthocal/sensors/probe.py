@@ -12,7 +12,7 @@ with the notation of `tool_indicator`, and o the trigger height of the probe.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import casadi as ca
@@ -139,8 +139,9 @@ class Probe(ToolIndicator):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and form of the surface, and the trigger height."""
+        surface = (replace(p, fixed=True) for p in self.artefact.nuisance_parameters)
         trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
-        return (*self.artefact.nuisance_parameters, *trigger)
+        return (*surface, *trigger)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Height of the surface, [m]."""

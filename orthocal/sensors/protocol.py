@@ -76,6 +76,9 @@ class NuisanceParameter(InUnit):
     parameter of one setup."""
     of_gauge: bool = False
     """True if all setups with the same gauge share the parameter."""
+    fixed: bool = False
+    """True for a part of the machine, such as its bed: all logs of a printer share the parameter.
+    """
     nominal: float = 0.0
     """Nominal value of the quantity, [unit]; setups that share the parameter must agree in it."""
 

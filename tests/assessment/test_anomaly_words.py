@@ -14,6 +14,7 @@ from orthocal import join_sessions
 from orthocal.assessment.words.anomalies import _text, describe_anomalies
 from orthocal.assessment.words.remedies import advise, advise_about_sessions, advise_repetition
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
+from orthocal.printers.settings import DeltaSettings
 from orthocal.units import MM
 
 
@@ -144,6 +145,18 @@ def test_the_same_line_of_another_file_is_named(session):
     joined = replace(session, readings=(first, second))
     both = Explanation("outlier", "reading", (0, 1))
     assert "type `repeat 7`, likewise the other lines." in advise_repetition(joined, both)
+
+
+def test_lines_of_a_log_are_named_once_and_a_log_is_not_deleted(session):
+    settings = DeltaSettings("klipper", 0.14, (0.28,) * 3, (0.5,) * 3)
+    log = replace(session, firmware=settings)
+    few = [Explanation("outlier", "reading", rows) for rows in ((1,), (0, 1))]
+    lines = [session.readings[i].line for i in (0, 1)]
+    assert f"delete lines {lines[0]}, {lines[1]} of readings.csv" in advise_repetition(log, *few)
+    last = tuple(i for i, r in enumerate(session.readings) if r.setup == session.readings[0].setup)
+    action = advise_repetition(log, Explanation("displaced gauge", "reading", last))
+    assert "probe again" in action
+    assert "delete" not in action
 
 
 def test_changes_between_sessions_that_readings_do_not_distinguish_are_listed(session):

@@ -45,7 +45,7 @@ from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
-from orthocal.calibration.refit import repeat_fit
+from orthocal.calibration.refit import calibrated_theta, repeat_fit
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.observation.observations import build_observations
@@ -154,7 +154,7 @@ def test_deviations_with_priors_are_as_large_as_expected():
         found = identified(first, "full")
         fit = repeat_fit(found, second)
         expected = expect_deviations(found, fit)
-        refit = assemble_calibration(fit, nominal=np.array([p.value for p in found.free]))
+        refit = assemble_calibration(fit, nominal=calibrated_theta(found, fit))
         sizes.append((expected.rms, refit.rms_before, expected.largest, refit.largest_before))
     rms, achieved, median, largest = np.array(sizes).T
     ratio = np.sqrt(np.mean(achieved**2) / np.mean(rms**2))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from calibrated import SOUND, UNJUDGED
 from commands import run_orthocal
-from simulated_printer import Printer, nominal, read_settings, rings, write_log
+from simulated_printer import Printer, nominal, read_settings, rings, write_log, write_settings
 
 from orthocal import (
     ExportError,
@@ -22,6 +22,8 @@ from orthocal import (
     draw_errors,
     draw_scene,
     export_calibration,
+    join_sessions,
+    judge_session,
     load_calibration,
     load_session,
     validate_calibration,
@@ -29,10 +31,11 @@ from orthocal import (
 )
 from orthocal.assessment.printer_settings import _find_targets, fit_firmware
 from orthocal.assessment.wording import tool_mm
-from orthocal.calibration.refit import restore_covariances
+from orthocal.calibration.refit import restore_covariances, restore_session
 from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.measurement.importing.printer_log import import_printer_log
+from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
+from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.output.scene.tool_errors import TOOL_ENTERED
 from orthocal.output.text.accuracy import FIRMWARE_NOTE
 from orthocal.output.text.answer import PRINT
@@ -278,6 +281,110 @@ def test_settings_that_were_not_entered_are_named(calibrated, tmp_path):
     assert numbers[0] > 5.0 * numbers[1]
 
 
+@pytest.mark.parametrize(
+    ("active", "kind", "names"),
+    [
+        (lambda _, new: new, None, ()),
+        (lambda old, _: old, "settings not entered", ()),
+        (
+            lambda old, new: replace(new, endstops=old.endstops),
+            "settings not entered",
+            ["endstops"],
+        ),
+        (
+            lambda old, new: replace(old, endstops=new.endstops),
+            "settings not entered",
+            ["radius", "rods", "tower angles"],
+        ),
+        (
+            lambda old, new: replace(new, angles=np.array([*new.angles[:1], *old.angles[1:]])),
+            "settings not entered",
+            ["angle of tower b"],
+        ),
+        (
+            lambda _, new: replace(new, endstops=new.endstops[[2, 1, 0]]),
+            "settings interchanged",
+            ["endstops of towers a and c"],
+        ),
+        (
+            lambda _, new: replace(new, endstops=np.add(new.endstops, [0.25, -0.25, 0.0])),
+            "bed moved",
+            [],
+        ),
+    ],
+)
+def test_active_settings_that_a_log_does_not_state_are_named(
+    calibrated, tmp_path, active, kind, names
+):
+    """Positions in the console belong to the active settings, and are read with the stated ones.
+
+    The angle of tower c is the same in both.
+    """
+    printer, calibration = calibrated
+    lines = FIRMWARES["klipper"].config_lines(fit_firmware(calibration, "klipper").settings)
+    stated, rng = read_settings("klipper", lines), np.random.default_rng(5)
+    z = printer.probe(active(nominal(), stated), rings(), noise=NOISE_MM, rng=rng)
+    cfg, log = tmp_path / "printer.cfg", tmp_path / "log.txt"
+    cfg.write_text(f"{write_settings('klipper', stated)}[probe]\nz_offset: {TRIGGER_MM}\n")
+    points = zip(rings(), z, strict=True)
+    log.write_text("".join(f"probe at {x:.3f},{y:.3f} is z={h:.6f}\n" for (x, y), h in points))
+    validation = validate_calibration(calibration, import_printer_log(log, settings=[cfg]).session)
+    assert validation.confirmed == (kind is None)
+    if kind is None:
+        assert validation.mistake is None
+        assert validation.refit.rms_before == pytest.approx(validation.expected_rms, rel=0.5)
+        assert validation.expected_rms < 2.0 * NOISE_MM * MM
+        return
+    assert (validation.mistake.explanation.kind, validation.mistake.explanation.names) == (
+        kind,
+        tuple(names),
+    )
+    decision = validation.assessment.decision
+    assert (decision.verdict, decision.exit_code) == ("review", 3)
+    assert "printer.cfg" in decision.action
+    assert "probe again" in decision.action
+
+
+def test_no_command_names_sessions_that_are_not_found_from_here(calibrated, tmp_path, monkeypatch):
+    """Paths of a calibration are those of the directory in which it was made."""
+    printer, calibration = calibrated
+    for name, seed in (("one", 2), ("two", 4)):
+        log = tmp_path / f"{name}.txt"
+        log.write_text(probe_log("klipper", printer, nominal(), np.random.default_rng(seed)))
+        write_printer_import(import_printer_log(log), tmp_path / name)
+    record = replace(calibration.session, path="one/session.yaml")
+    calibration = replace(calibration, session=record)
+    monkeypatch.chdir(tmp_path)
+    validation = validate_calibration(calibration, load_session("two"))
+    assert "orthocal calibrate one two " in to_text(render_validation(validation))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    shown = " ".join(to_text(render_validation(validation)).split())
+    assert "orthocal calibrate" not in shown
+    assert "in the directory in which the calibration was made" in shown
+
+
+def test_logs_of_a_printer_share_their_bed_unless_its_setup_has_another_name(calibrated):
+    """Another sensor of a machine is mounted anew in each session."""
+    _, calibration = calibrated
+    one = restore_session(calibration)
+    bed = one.setups["bed"]
+    remounted = replace(
+        one,
+        setups={"bed2": replace(bed, name="bed2")},
+        readings=tuple(replace(r, setup="bed2") for r in one.readings),
+    )
+    without = [replace(s, firmware=None) for s in (one, one)]
+    for sessions, names in (
+        ((one, one), {"setup.bed"}),
+        ((one, remounted), {"setup.bed", "setup.bed2"}),
+        (without, {"setup.session-1/bed", "setup.session-2/bed"}),
+    ):
+        joined = join_sessions([replace(s, sha256="", path=None) for s in sessions])
+        parameters = nuisance_parameters(joined).parameters
+        assert {p.name for p in parameters} == {f"{n}.{k}" for n in names for k in ("yaw", "roll")}
+
+
 def test_the_second_probing_ends_the_walk(calibrated, probed_again):
     """It confirms the first, and nothing more has to be entered."""
     _, calibration = calibrated
@@ -303,6 +410,17 @@ def test_the_second_probing_ends_the_walk(calibrated, probed_again):
     assert (np.array(sizes[0]) <= sizes[1]).all()  # of both beds, only that of the last counts
     assert PRINT in to_text(render_validation(validation))
     assert describe_next(fit, Path("one"), Path("new")).startswith("Next: print.")
+
+
+def test_old_settings_that_are_given_last_are_noted(calibrated, probed_again):
+    """Only new ones have corrections of single towers."""
+    old = replace(restore_session(calibrated[1]), sha256="")
+    for sessions, noted in (([old, probed_again], False), ([probed_again, old], True)):
+        orders = [
+            f for f in judge_session(join_sessions(sessions)).findings if f.kind == "wrong order"
+        ]
+        assert [f.severity for f in orders] == ["note"] * noted
+        assert all("settings are assumed" in f.text for f in orders)
 
 
 def test_an_endstop_that_moved_is_named(calibrated, probed_again):

@@ -15,7 +15,7 @@ from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
 from orthocal.assessment.words.remedies import advise_about_sessions
 from orthocal.calibration.build_record import assemble_calibration
-from orthocal.calibration.refit import repeat_fit
+from orthocal.calibration.refit import calibrated_theta, repeat_fit
 from orthocal.errors import ParameterError, SessionError
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
@@ -145,8 +145,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
         chances.append(judge_deviations(found, fit).p_value)
-        nominal = np.array([p.value for p in found.free])
-        achieved = assemble_calibration(fit, nominal=nominal).rms_before
+        achieved = assemble_calibration(fit, nominal=calibrated_theta(found, fit)).rms_before
         sizes.append((expect_deviations(found, fit).rms, achieved))
     # one in a hundred is refused for its deviations
     assert binom.cdf(np.sum(np.array(chances) >= BY_CHANCE), SEEDS, 1 - BY_CHANCE) > 0.01

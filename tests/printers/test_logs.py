@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from commands import run_orthocal
 from simulated_printer import Firmware, nominal, rings, write_log, write_settings
 
-from orthocal import load_session
+from orthocal import calibrate, join_sessions, load_session
+from orthocal.cli.files import require_not_calibrated
 from orthocal.errors import SessionError
 from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
 from orthocal.printers.firmwares import FIRMWARES, find_firmware
@@ -384,6 +386,21 @@ def test_saved_heights_with_entered_settings_are_a_copy(tmp_path):
     assert "new/readings.csv: has the same readings as old/session.yaml" in done.stderr
     one, other = (load_session(tmp_path / name) for name in ("old", "new"))
     assert one.firmware.homed != other.firmware.homed
+
+
+def test_a_copy_of_one_of_several_calibrated_logs_is_refused(tmp_path):
+    """A joint calibration names the postures of each log after its session."""
+    heights = 0.1 * np.sin(rings()[:, 0]), 0.1 * np.cos(rings()[:, 1]), 0.1 * np.sin(rings()[:, 1])
+    for name, z in zip(("old", "second", "third"), heights, strict=True):
+        (tmp_path / "log.txt").write_text(write_log("klipper", odd(), rings(), z, -1.0))
+        write_printer_import(import_printer_log(tmp_path / "log.txt"), tmp_path / name)
+    old, second, third = (load_session(tmp_path / n) for n in ("old", "second", "third"))
+    calibration = calibrate(join_sessions([old, second]))
+    require_not_calibrated([third], calibration)
+    for copied in (old, second):
+        copy = replace(copied, sha256="")
+        with pytest.raises(SessionError, match=f"same readings as .*{copied.path.parent.name}"):
+            require_not_calibrated([copy], calibration)
 
 
 def test_options_of_tables_are_refused_for_a_log(tmp_path):

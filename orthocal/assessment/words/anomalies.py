@@ -48,6 +48,10 @@ LEAST_CHANCE = 1e-4
 UNITS = {25.4: "in inches", 1e3: "in m", 1e-3: "in µm"}
 """Unit of wrongly written readings by the factor that corrects them; others are mm as inches."""
 
+BETWEEN_LOGS = "settings not entered", "settings interchanged", "bed moved"
+OF_BACKLASH = "backlash not entered", "backlash halved", "backlash entered twice"
+"""Kinds of anomalies that share a sentence."""
+
 
 def describe_anomalies(session: Session, result: Anomalies) -> list[Finding]:
     """Findings about all anomalies, and about readings that they do not explain."""
@@ -246,16 +250,18 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
-def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
+def describe_wrong_order(given: str, last: str, *, timed: bool, firmware: bool) -> Finding:
     """Finding about joined sessions that were not given in the order of measuring.
 
     Args:
         given: Session that was given last.
         last: Session that was measured last.
-        timed: Whether the times of the readings state this; otherwise the active offsets.
+        timed: Whether the times of the readings state this; otherwise the active numbers.
+        firmware: Whether these are settings of a printer's firmware, not offsets.
     """
+    numbers = "settings" if firmware else "offsets"
     assumed = (
-        f"The present offsets are assumed to be those of session {given}, which was given last."
+        f"The present {numbers} are assumed to be those of session {given}, which was given last."
     )
     if timed:
         return review(
@@ -265,7 +271,8 @@ def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
         )
     return note(
         "wrong order",
-        f"{assumed} But its controller corrects nothing, unlike that of session {last}.",
+        f"{assumed} But its {'firmware' if firmware else 'controller'} corrects nothing, unlike "
+        f"that of session {last}.",
         f"If session {last} is the latest, give it last.",
     )
 
@@ -423,9 +430,8 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
         "offsets entered twice": lambda: _entered(e, "added twice"),
         "offsets interchanged": lambda: _entered(e, "interchanged"),
-        "backlash not entered": lambda: _compensated(session, e),
-        "backlash halved": lambda: _compensated(session, e),
-        "backlash entered twice": lambda: _compensated(session, e),
+        **dict.fromkeys(BETWEEN_LOGS, lambda: _between_logs(e)),
+        **dict.fromkeys(OF_BACKLASH, lambda: _compensated(session, e)),
     }
     return texts[e.kind]()
 
@@ -618,6 +624,21 @@ def _entered(e: Explanation, how: str) -> str:
     """Clause about wrongly entered offsets."""
     which = "offset of {} was" if len(e.drives) == 1 else "offsets of {} were"
     return f"in session {e.sessions[0]} the {which.format(joined(e.drives))} {how}"
+
+
+def _between_logs(e: Explanation) -> str:
+    """Clause about settings of a printer's firmware that were not active as stated, or its bed."""
+    if e.kind == "bed moved":
+        return (
+            f"the bed was tilted before session {e.sessions[0]}, or endstops differ from those "
+            "that it states"
+        )
+    if e.kind == "settings interchanged":
+        return f"in session {e.sessions[0]} the firmware had interchanged {joined(e.names)}"
+    return (
+        f"the settings that session {e.sessions[0]} states were not active: the firmware still had "
+        f"the previous {joined(e.names or ('settings',))}"
+    )
 
 
 def _compensated(session: Session, e: Explanation) -> str:

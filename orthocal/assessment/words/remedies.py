@@ -11,9 +11,18 @@ from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.measurement.files.session_keys import BACKLASH_KEYS, OFFSET_KEYS, keys_for_unit
+from orthocal.printers.settings import FirmwareName
 from orthocal.session.session import Reading, Session, split_label
 from orthocal.text import quote_path, spans
 from orthocal.units import MM, Unit, format_fixed, trim_zeros
+
+ACTIVE_SETTINGS: dict[FirmwareName, str] = {
+    "klipper": "printer.cfg, and its part SAVE_CONFIG that takes precedence,",
+    "marlin": "what M503 prints",
+    "marlin1": "what M503 prints",
+    "reprapfirmware": "what M665 and M666 print",
+}
+"""Settings that a firmware has."""
 
 
 def advise(session: Session, e: Explanation) -> str:
@@ -82,8 +91,13 @@ def advise_repetition(session: Session, *explanations: Explanation) -> str:
             repeat = (
                 "Measure again and correct the command DELTA_ANALYZE, then import the log again"
             )
-        lines = [r.line for r in rows if r.line is not None]
-        omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
+        concerned = {i for e in explanations for i in e.rows}
+        setups = {r.setup for r in rows}
+        if 2 * len(concerned) > sum(r.setup in setups for r in session.readings):
+            return f"{repeat}."
+        lines = sorted({r.line for r in rows if r.line is not None})
+        name = quote_path(rows[0].file) if session.joined and rows[0].file else "readings.csv"
+        omitted = f"delete {spans(lines, 'line')} of {name}" if lines else "leave it out"
         return f"{repeat}. Or {omitted}, and calibrate again."
     what = "it" if len(rows) == 1 else "these"
     file = rows[0].file or session.readings_path
@@ -145,10 +159,7 @@ def advise_factor(explanations: Sequence[Explanation]) -> str:
 def advise_about_sessions(session: Session, e: Explanation) -> str:
     """Action for numbers that were entered wrongly, or a change between sessions."""
     if session.firmware is not None:
-        return (
-            "Calibrate the last log alone and export its settings: they must belong to the present "
-            "printer."
-        )
+        return _advise_about_logs(session, session.firmware.firmware, e)
     if e.kind == "lost steps":
         return (
             "Home the machine, go to the first posture of a setup and read it again. If it has "
@@ -181,6 +192,32 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
     return (
         f"Calibrate session {first} and later ones without the earlier ones: the values to enter "
         "must belong to the present machine."
+    )
+
+
+def _advise_about_logs(session: Session, firmware: FirmwareName, e: Explanation) -> str:
+    """Action for settings of a printer that were not active, or a change between its logs."""
+    if e.kind in ("settings not entered", "settings interchanged"):
+        return (
+            f"Compare {ACTIVE_SETTINGS[firmware]} with the settings of the export. If they differ, "
+            "enter those of the export, home, probe again and import the new log. If they agree, "
+            "the log is older: import it again with the settings of its time."
+        )
+    if e.kind == "bed moved":
+        return (
+            f"Compare the endstops in {ACTIVE_SETTINGS[firmware]} with those of the export. If "
+            "they differ, enter those of the export, home, probe again and import the new log. If "
+            "they agree, the bed has moved: calibrate the last log alone and export its settings."
+        )
+    imported = ""
+    if len({part.firmware for part in session.parts}) == 1:
+        imported = (
+            "All logs state the same settings. If others were active during the last one, import "
+            "it again with these. Otherwise, c"
+        )
+    return (
+        f"{imported or 'C'}alibrate the last log alone and export its settings: they must belong "
+        "to the present printer."
     )
 
 

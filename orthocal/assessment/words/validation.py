@@ -160,13 +160,15 @@ def further_settings(change: Finding | None, *, unchanged: bool) -> Finding:
 
     Args:
         change: Finding about the errors with new settings; None if they are unknown.
-        unchanged: Whether the new log states the settings of the calibration.
+        unchanged: Whether the new session states the settings of the calibration.
     """
-    texts = ["Settings from both probings are still better."]
+    texts = ["Settings from all readings are still better."]
     if change is not None:
         texts.append(change.text)
     if unchanged:
-        texts.append("The new log states the settings of the earlier one: new ones are not active.")
+        texts.append(
+            "The new session states the settings of the earlier one: new ones are not active."
+        )
     return note(
         "further change",
         " ".join(texts),

@@ -12,6 +12,7 @@ from orthocal.assessment.validation import Validation
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.assessment_record import FindingKind
+from orthocal.io.files import exists
 from orthocal.output.text.answer import (
     CONVERTED,
     PRINT,
@@ -53,6 +54,12 @@ EXPECTED_NOTE = (
     "deviations: those of well-predicted readings count more."
 )
 """Meaning of the column `expected`, and why the limit can be smaller."""
+
+FROM_ELSEWHERE = (
+    ", validate in the directory in which the calibration was made: its sessions are not found "
+    "from here."
+)
+"""End of a sentence in place of a command."""
 
 MORE = "--details prints deviations and all readings."
 
@@ -129,6 +136,8 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
         return []
     stated = validation.final_calibration.robot.parameters.stated
     sessions = [Path(path).parent for path in paths if path is not None]
+    if not all(exists(path) for path in sessions):  # recorded as seen from another directory
+        return [Text(), render_next(f"{words.removesuffix(':')}{FROM_ELSEWHERE}")]
     command = calibrate_command(sessions, stated, calibration=validation.final_calibration)
     return [Text(), render_next(words, [command])]
 
