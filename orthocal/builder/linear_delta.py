@@ -52,7 +52,8 @@ class LinearDelta(Dimensions):
     """Smallest and largest height of the hinges on a slide above those on the platform, with the
     tool on the bed."""
     platform: float = 0.03
-    """Distance of the tool centre point from the hinges on the platform."""
+    """Horizontal distance of the tool centre point from the hinges on the platform, which are at
+    its height."""
     rods_apart: float = 0.05
     rod_radius: float = 0.003
 
@@ -88,8 +89,9 @@ class LinearDelta(Dimensions):
         ),
         Dimension(
             "platform",
-            "Distance of the tool centre point from the hinges on the platform, mm",
-            "From the tool centre point to the hinges on the platform.",
+            "Horizontal distance of the tool centre point from the hinges on the platform, mm",
+            "Horizontal distance of the hinges on the platform from the tool centre point, which\n"
+            "is at their height.",
             usual="30",
         ),
         RODS_APART,
