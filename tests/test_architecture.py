@@ -197,7 +197,7 @@ UNNEEDED = {
 
 UNNEEDED_LIBRARIES = {
     *("matplotlib", "meshcat", "multiprocessing", "threadpoolctl", "tornado", "yourdfpy"),
-    *("scipy.interpolate", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial"),
+    *("scipy.interpolate", "scipy.optimize", "scipy.sparse", "scipy.spatial"),
     "scipy.stats",
 }
 

@@ -24,6 +24,9 @@ from orthocal.statistics.information import RANK_THRESHOLD, Information
 NEGLIGIBLE = 1e-9
 """Coefficient of a combination, in prior std, below which it is a rounding error."""
 
+EQUAL_NORMS = 1e-9
+"""Relative difference of the norms of two columns below which it is a rounding error."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Combination:
@@ -196,7 +199,10 @@ def find_base_parameters(
         return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # all are resolvable
     from scipy import linalg
 
-    r, order = linalg.qr(factor, mode="r", pivoting=True)
+    # rounding errors must not decide between equal columns: earlier parameters precede
+    preference = 1.0 - EQUAL_NORMS * np.arange(factor.shape[1])
+    _, order = linalg.qr(factor * preference, mode="r", pivoting=True)
+    (r,) = linalg.qr(factor[:, order], mode="r")
     diagonal = np.abs(np.diag(r))
     count = int((diagonal > threshold).sum())
     if not count:
@@ -222,7 +228,8 @@ def _find_alike(
     norms = np.linalg.norm(factor, axis=0)
     products = factor.T @ factor
     # rounding errors must not decide between equal norms
-    order = np.argsort(-np.round(norms / (norms.max(initial=0.0) or 1.0), 9), kind="stable")
+    steps = np.round(norms / (EQUAL_NORMS * (norms.max(initial=0.0) or 1.0)))
+    order = np.argsort(-steps, kind="stable")
     pending = [int(i) for i in order if norms[i] > threshold]
     groups = []
     while pending:
