@@ -27,11 +27,11 @@ CALIBRATED = Firmware(
 """Settings that a calibration chose: unlike every nominal machine."""
 
 
-@pytest.fixture(scope="module", params=[nominal(), CALIBRATED], ids=["design", "calibrated"])
-def printer(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def printer(tmp_path_factory):
     """Session of a printer's log, and a plan with a ball bar from it."""
     folder = tmp_path_factory.mktemp("printer")
-    (folder / "log.txt").write_text(write_log("klipper", request.param, rings(), np.zeros(41)))
+    (folder / "log.txt").write_text(write_log("klipper", CALIBRATED, rings(), np.zeros(41)))
     write_printer_import(import_printer_log(folder / "log.txt"), folder / "log")
     (folder / "bar.yaml").write_text(BAR)
     log = load_session(folder / "log")
