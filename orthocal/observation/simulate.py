@@ -373,7 +373,12 @@ def read_errors(
 def quantity(parameter: Parameter, value: float) -> tuple[str, float]:
     """Key of a truth.yaml with the unit of a parameter, and its value [SI] in this unit."""
     key = f"{parameter.name}_{parameter.edge_unit}"
-    return key, float(f"{value * parameter.edge_factor:.9g}")
+    return key, _nine_digits(value * parameter.edge_factor)
+
+
+def _nine_digits(value: float) -> float:
+    """A number that does not depend on rounding errors of the simulation."""
+    return float(f"{value:.9g}")
 
 
 def drawn_gauge_errors(simulated: SimulatedSession, stated: Iterable[str]) -> dict[str, float]:
@@ -396,7 +401,7 @@ def truth_document(simulated: SimulatedSession) -> str:
     document = {"errors": dict(quantity(parameters[n], v) for n, v in errors.items())}
     if adjusted := simulated.session.adjusted:
         document["adjusted_mm"] = {name: to_mm(amount) for name, amount in adjusted.items()}
-    document["zeros_mm"] = {name: to_mm(value) for name, value in simulated.zeros.items()}
+    document["zeros_mm"] = {name: _nine_digits(v / MM) for name, v in simulated.zeros.items()}
     if simulated.nuisance:
         by_name = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
         nuisance = simulated.nuisance

@@ -40,7 +40,7 @@ def test_both_backends_give_the_same_numbers(request, name, count):
     if robot.tcp is not None:
         tested += [functions.closure_and_tool, functions.tool_jacobian]
     for function in tested:
-        found, expected = (function.evaluate(*where, backend=b) for b in BACKENDS)
+        found, expected = (function(*where, backend=b) for b in BACKENDS)
         assert_same(found, expected)
         assert_same(function(*where), expected)
 
@@ -52,8 +52,8 @@ def test_a_row_of_an_input_holds_for_successive_points(orthoglide, backend):
     for rows in (1, 11, 44):
         placements = where[2] + 1e-4 * rng.normal(size=(rows, where[2].size))
         repeated = np.repeat(placements, 44 // rows, axis=0)
-        expected = function.evaluate(*where[:2], repeated, backend=backend)
-        assert_same(function.evaluate(*where[:2], placements, backend=backend), expected)
+        expected = function(*where[:2], repeated, backend=backend)
+        assert_same(function(*where[:2], placements, backend=backend), expected)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -65,7 +65,7 @@ def test_inputs_of_other_shapes_are_refused(shapes, backend):
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     batch = BatchFunction(ca.Function("f", [x, y], [ca.dot(x, x) * y]))
     with pytest.raises(ValueError, match="expected 3, 2 columns"):
-        batch.evaluate(*map(np.ones, shapes), backend=backend)
+        batch(*map(np.ones, shapes), backend=backend)
 
 
 @pytest.mark.parametrize("count", [llvm.LANES - 3, 101])
@@ -85,7 +85,7 @@ def test_every_operation_is_casadis(count):
     values[1, ::10] = 0.0
     values = values[:, :count]
     batch = BatchFunction(function)
-    assert_same(*(batch.evaluate(*values, backend=b) for b in BACKENDS))
+    assert_same(*(batch(*values, backend=b) for b in BACKENDS))
 
 
 @pytest.mark.parametrize("example", ["raw-cycles", "workshop"])
@@ -101,7 +101,7 @@ def test_a_function_with_an_unknown_instruction_is_evaluated_by_casadi():
     x = ca.SX.sym("x")
     function = ca.Function("unknown", [x], [ca.erf(x)])
     assert llvm.list_instructions(function) is None
-    (found,) = BatchFunction(function).evaluate(np.ones((50, 1)), backend="llvm")
+    (found,) = BatchFunction(function)(np.ones((50, 1)), backend="llvm")
     assert found[0, 0] == float(ca.erf(1.0))
 
 
@@ -120,9 +120,9 @@ def test_the_backend_depends_on_the_call_alone(orthoglide, monkeypatch, installe
 
 def test_casadi_evaluates_where_the_interpreter_cannot_be_compiled(orthoglide, monkeypatch):
     function, where = robot_functions(orthoglide).closure_by_passive, points(orthoglide, 3)
-    expected = function.evaluate(*where, backend="casadi")
+    expected = function(*where, backend="casadi")
     monkeypatch.setattr(llvm, "compile_interpreter", lambda: None)
-    assert_same(function.evaluate(*where, backend="llvm"), expected)
+    assert_same(function(*where, backend="llvm"), expected)
 
 
 def test_instructions_are_cached_on_disk(orthoglide, tmp_path, monkeypatch):
@@ -156,14 +156,14 @@ def test_a_large_function_is_loaded_only_for_casadi(orthoglide, tmp_path, monkey
     def fresh():
         return BatchFunction(load, matrices=["y1", "y2"], sparse=["y3"], key="a key")
 
-    expected = original.evaluate(*where, backend="casadi")
+    expected = original(*where, backend="casadi")
     for times in (1, 1):  # the first call stores layout and instructions
         batch = fresh()
-        assert_same(batch.evaluate(*where, backend="llvm"), expected)
+        assert_same(batch(*where, backend="llvm"), expected)
         for ours, theirs in zip(batch.patterns["y3"], original.patterns["y3"], strict=True):
             assert np.array_equal(ours, theirs)
         assert len(loaded) == times
-    assert_same(fresh().evaluate(*where, backend="casadi"), expected)
+    assert_same(fresh()(*where, backend="casadi"), expected)
     assert len(loaded) == 2
 
 
@@ -171,5 +171,5 @@ def test_a_small_function_is_not_cached(tmp_path, monkeypatch):
     monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
     x = ca.SX.sym("x")
     batch = BatchFunction(lambda: ca.Function("small", [x], [2.0 * x]), key="a key")
-    assert_same(batch.evaluate([[3.0]], backend="llvm"), (np.array([[6.0]]),))
+    assert_same(batch([[3.0]], backend="llvm"), (np.array([[6.0]]),))
     assert not (tmp_path / "cache").exists()

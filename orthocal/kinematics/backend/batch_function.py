@@ -100,33 +100,27 @@ class BatchFunction:
             for name, (rows, columns) in self.layout.patterns.items()
         }
 
-    def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
+    def __call__(self, *inputs: ArrayLike, backend: Backend | None = None) -> tuple[Array, ...]:
         """Evaluate the function at K points.
 
         Args:
             inputs: Shape (K, n) each; (K/m, n) if each row applies to m successive points, such as
                 the postures of one machine; (n,) if one row applies to all.
+            backend: The faster one by default. CasADi evaluates functions with an instruction that
+                the LLVM backend lacks.
 
         Returns:
             Each output with shape (K, rows, columns). Column vectors that are not `matrices` have
             shape (K, rows), sparse outputs (K, nnz).
-        """
-        arrays = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in inputs]
-        count = self._count(arrays)
-        large = count >= MIN_POINTS and self.layout.n_instructions * count >= MIN_OPERATIONS
-        fast = large and llvm.is_installed()
-        return self.evaluate(*arrays, backend="llvm" if fast else "casadi")
-
-    def evaluate(self, *inputs: ArrayLike, backend: Backend) -> tuple[Array, ...]:
-        """Evaluate with a stated backend; arguments and result are those of `__call__`.
-
-        CasADi evaluates functions with an instruction that the LLVM backend lacks.
 
         Raises:
-            ValueError: If the inputs do not have the shapes that `__call__` states.
+            ValueError: If the inputs do not have these shapes.
         """
         arrays = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in inputs]
         count = self._count(arrays)
+        if backend is None:
+            large = count >= MIN_POINTS and self.layout.n_instructions * count >= MIN_OPERATIONS
+            backend = "llvm" if large and llvm.is_installed() else "casadi"
         self._require_shapes(arrays, count)
         nonzeros = None
         if backend == "llvm" and self._program is not None:
