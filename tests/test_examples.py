@@ -307,7 +307,7 @@ def test_enlargement_and_residuals_on_the_pages_are_correct(root):
     enlarged = f"enlarged {scene.exaggeration:g} times, arrows {scene.arrow_scale:g} times"
     assert enlarged in text
     assert "the residuals are ten times the noise of the gauge" in results
-    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    noise, gauge = calibration.noise, calibration.gauges[0].sigma
     assert noise.residual_sigma / gauge == pytest.approx(10.0, abs=0.5)
 
 

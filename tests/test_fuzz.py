@@ -94,9 +94,9 @@ def test_failures_of_workers_are_reported(good, tmp_path, monkeypatch):
 def test_noise_whose_square_underflows_is_refused(tmp_path):
     """Quotients by a σ of 1e-308 overflow when they are squared (seed 10, case 27478)."""
     document = calibration_document(calibrated(EXPERIMENT_2))
-    document["session"]["gauge_sigma"] = 1e-308
+    document["gauges"][0]["sigma"] = 1e-308
     (tmp_path / "calibration.json").write_text(json.dumps(document))
-    with pytest.raises(CalibrationFileError, match=r"session.gauge_sigma: found '1e-308'"):
+    with pytest.raises(CalibrationFileError, match=r"gauges\[0\]\.sigma: found '1e-308'"):
         load_calibration(tmp_path)
 
 

@@ -285,8 +285,6 @@ def _session_record(session: Session) -> SessionRecord:
         title=session.title,
         source=session.source,
         sha256=session.sha256,
-        gauge_sigma=session.gauge.sigma,
-        gauge_resolution=session.gauge.resolution,
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
         controller_origin=session.controller_origin,
         purpose=session.purpose,

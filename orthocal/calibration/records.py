@@ -107,10 +107,6 @@ class SessionRecord:
     title: str
     source: str
     sha256: str
-    gauge_sigma: PositiveInSI | None
-    """Stated standard deviation of a reading, [m]."""
-    gauge_resolution: PositiveInSI | None
-    """Resolution of the gauge, [m]."""
     controller_offsets: Many[Number] | None
     """Active offsets, [m, rad]; None if not stated."""
     controller_origin: tuple[Number, Number, Number]

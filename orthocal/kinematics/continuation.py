@@ -48,10 +48,6 @@ MAX_NEWTON_STEP = 1e3
 MAX_LAST_STEP = 1e-6
 """Longer steps from closed loops are caused by nearly singular postures, [m or rad]."""
 
-EXPECTED_CLOSED = 1e-4 * CLOSURE_TOLERANCE
-"""Residual, expected from the quadratic convergence of Newton's method, below which a step is the
-last one and needs no evaluation, [m or rad]."""
-
 MAX_NEWTON_STEPS = 30
 MAX_STEP_REDUCTIONS = 3
 UNTESTED_STEPS = 4
@@ -401,7 +397,7 @@ class _Path:
             return residuals, jacobians, largest
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
-        active, nearly_closed = np.flatnonzero(worst >= tolerance), np.zeros(len(x), dtype=np.bool_)
+        active = np.flatnonzero(worst >= tolerance)
         for count in range(1, MAX_NEWTON_STEPS + 1):
             if not active.size:
                 break
@@ -422,14 +418,10 @@ class _Path:
                 if not rows.size:
                     break
             active = np.sort(np.concatenate(improved))
-            remaining = worst[active] / before[active]
-            nearly_closed[active] = worst[active] * remaining**2 < EXPECTED_CLOSED
-            limit = MAX_REMAINING if count > UNTESTED_STEPS else 1.0
-            is_open = (worst[active] >= tolerance) & ~nearly_closed[active]
-            active = active[is_open & (remaining < limit)]
+            limit = before[active] * (MAX_REMAINING if count > UNTESTED_STEPS else 1.0)
+            active = active[(worst[active] >= tolerance) & (worst[active] < limit)]
         regular = np.zeros(len(x), dtype=np.bool_)
-        ending = nearly_closed | (worst < tolerance)
-        closed = np.flatnonzero(ending & np.isfinite(jacobians).all(axis=(1, 2)))
+        closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
         if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is known
             evaluated = residuals[closed], jacobians[closed]
             if self._allow_singular:
@@ -438,5 +430,4 @@ class _Path:
                 step, regular[closed] = system.regular_step(*evaluated)
             small = np.abs(step).max(axis=1) < MAX_LAST_STEP
             x[closed[small]] += step[small]
-            worst[closed[small & nearly_closed[closed]]] = EXPECTED_CLOSED
         return x, worst, regular

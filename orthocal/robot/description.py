@@ -94,12 +94,21 @@ class LegKeys(Keys):
     """Round rods that a gauge can touch, by name."""
 
 
+def _require_distinct(names: list[str]) -> list[str]:
+    """Refuse a list that names something twice."""
+    if len(set(names)) != len(names):
+        raise ValueError(f"found [{', '.join(names)}]; expected each name once")
+    return names
+
+
 class TcpKeys(Keys):
     """Tool centre point."""
 
     frame: Name
     """Frame whose origin it is."""
-    coordinates: Annotated[list[Coordinate], Field(min_length=1, max_length=3)] = ["x", "y", "z"]
+    coordinates: Annotated[
+        list[Coordinate], Field(min_length=1, max_length=3), AfterValidator(_require_distinct)
+    ] = ["x", "y", "z"]
     """Commanded world coordinates; one per drive if postures are tool positions."""
 
 

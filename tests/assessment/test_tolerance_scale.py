@@ -114,7 +114,7 @@ def test_a_profile_interval_counts_unmodelled_errors_once(full, offsets):
         assert p.interval == pytest.approx((p.value - half, p.value + half), abs=2e-3 * half)
     assert full.unmodelled.names == ()
     # the residuals of offsets contain unmodelled errors ten times larger than the stated noise
-    assert offsets.noise.sigma > 5.0 * offsets.session.gauge_sigma
+    assert offsets.noise.sigma > 5.0 * offsets.gauges[0].sigma
 
 
 def test_uncertainties_of_mountings_are_within_their_tolerances(full, offsets):

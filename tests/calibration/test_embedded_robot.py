@@ -123,7 +123,7 @@ def test_files_versions_and_seed_are_in_the_file(mill):
     assert set(versions) == {"orthocal", "python", "pin", "casadi", "numpy", "scipy"}
     assert versions["python"] == platform.python_version()
     assert versions["orthocal"] == orthocal.__version__
-    assert document["session"]["seed"] is None
+    assert document["session"]["seed"] == 1  # that of the example
     plan = load_plan(mill / "first")
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=7).session
     loaded = load_session(write_session(session, mill / "simulated"))

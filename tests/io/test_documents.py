@@ -113,12 +113,8 @@ def change(document, keys, value):
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        (
-            ["session", "gauge_sigma"],
-            0,
-            "session.gauge_sigma: found '0'; expected greater than 0",
-        ),
-        (["session", "gauge_sigma"], 1e-300, "expected at least 1e-16"),
+        (["gauges", 0, "sigma"], 0, "gauges[0].sigma: found '0'; expected greater than 0"),
+        (["gauges", 0, "sigma"], 1e-300, "expected at least 1e-16"),
         (["noise", "residual_sigma"], -1.0, "expected greater than or equal to 0"),
         (["identifiability", "n_postures"], 10**30, "expected less than or equal to 1000000000"),
         (["identifiability", "n_readings"], 10**400, "has 401 characters"),

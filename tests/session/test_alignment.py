@@ -37,7 +37,10 @@ ORDER = {"reversed": lambda n: np.arange(n)[::-1], "shuffled": np.random.default
 
 @pytest.fixture(scope="module")
 def workshop():
-    return session_of("workshop")
+    """Readings whose setups state no alignment posture."""
+    session = session_of("workshop")
+    setups = {name: replace(s, aligned_at=None) for name, s in session.setups.items()}
+    return replace(session, setups=setups)
 
 
 def ordered(session, order):

@@ -148,7 +148,7 @@ def _spread(calibration: Calibration) -> tuple[Array, str, list[tuple[float, str
         sigmas = np.array([calibration.row_sigma(r) for r in rows])
         return np.sort(residuals / sigmas), "σ of its gauge", [(1.0, "σ of each gauge", "-")]
     factors = np.array([calibration.noise_factor(r) for r in rows])
-    gauge, sigma = calibration.session.gauge_sigma, calibration.sigma / MM
+    gauge, sigma = calibration.gauges[0].sigma, calibration.sigma / MM
     stated = math.nan if gauge is None else gauge * calibration.row_factor / MM
     lines = [
         (sigma, f"σ of a {_row_noun(calibration)}: {sigma:.2g} mm", "-"),

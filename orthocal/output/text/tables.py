@@ -260,10 +260,11 @@ def render_fit(calibration: Calibration) -> RenderableType:
             f"σ of a reading from repeated cycles: {mm(noise.cycles_sigma)} mm, "
             f"{noise.cycles_dof} degrees of freedom"
         )
-    if c.session.gauge_sigma is not None and noise.source != "gauge":
-        text = f"σ stated for the gauge: {mm(c.session.gauge_sigma)} mm a reading"
+    stated = c.gauges[0].sigma
+    if stated is not None and noise.source != "gauge":
+        text = f"σ stated for the gauge: {mm(stated)} mm a reading"
         if c.rows_are_differences:
-            text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
+            text += f", {mm(stated * math.sqrt(2.0))} mm a difference"
         lines.append(text)
     return noted(table, *lines)
 

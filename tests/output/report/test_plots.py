@@ -438,7 +438,7 @@ def test_lines_of_the_spread_are_sigma_less_what_was_fitted(table1, raw):
         part = np.sqrt(calibration.noise.residual_dof / len(calibration.residuals))
         np.testing.assert_allclose(slope, calibration.sigma * 1e3 * part, rtol=UNIT)
         given_x, given_y = line(axes, "σ stated for the gauge")
-        given = calibration.session.gauge_sigma * calibration.row_factor
+        given = calibration.gauges[0].sigma * calibration.row_factor
         np.testing.assert_allclose(
             given_y[1] / given_x[1] / slope, given / calibration.sigma, rtol=UNIT
         )

@@ -221,6 +221,9 @@ def test_texts_from_files_are_escaped(raw_cycles):
     renamed = rename_setups(raw_cycles, {name: f"{name}{EVIL}" for name in raw_cycles.setups})
     session = replace(
         renamed,
+        setups={
+            n: replace(s, aligned_at=f"{s.aligned_at}{EVIL}") for n, s in renamed.setups.items()
+        },
         title=EVIL,
         source=EVIL,
         postures={
