@@ -200,15 +200,17 @@ class PeerProblem:
         """Continue from a solution with central differences, whose optimum is nearer.
 
         With forward differences weakly determined errors stop up to 0.007 tolerances beside it.
+        Up to there the Jacobian does not change.
 
         Args:
             errors: The solution, shape (n_free,), [m, rad].
         """
         began = time.process_time()
+        jacobian = self._central_jacobian(errors)
         found = least_squares(
             self.residuals,
             errors,
-            jac=self._central_jacobian,
+            jac=lambda _: jacobian,
             method="lm",
             x_scale=self.prior_stds,
             ftol=REFINED_STOP,
