@@ -23,7 +23,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from orthocal.arrays import Array
-from orthocal.io.documents import Number
+from orthocal.io.documents import LARGEST_NUMBER, Number
 
 Item = TypeVar("Item")
 
@@ -75,9 +75,14 @@ class _AsLists:
         )
 
 
-Vector = Annotated[Array, _AsLists(Many[Number])]
-Sizes = Annotated[Array, _AsLists(Many[Size])]
-Matrix = Annotated[Array, _AsLists(Many[Many[NumberOrNaN]])]
+_Entry = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)
+]
+"""Number of an array, which pydantic checks without calling Python."""
+
+Vector = Annotated[Array, _AsLists(Many[_Entry])]
+Sizes = Annotated[Array, _AsLists(Many[Annotated[_Entry, Field(ge=0.0)]])]
+Matrix = Annotated[Array, _AsLists(Many[Many[_Entry | None]])]
 
 
 class As:
