@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import find_below_bed, tool_at_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.observations import drive_table
 from orthocal.robot.model import Robot
@@ -141,6 +142,13 @@ def shown_tool(session: Session, points: Array) -> Array:
     # a point out of reach is refused elsewhere
     drives = nominal_closure(session.robot).inverse(points, failures=Failures())
     return session.firmware.forward(drives)
+
+
+def below_bed(session: Session, points: Array, names: Sequence[str] | None = None) -> Failures:
+    """Rows of tool positions that the controller displays below the bed of the machine."""
+    if session.robot.bed is None:
+        return {}
+    return find_below_bed(session.robot, shown_tool(session, points), names)
 
 
 def start_point(session: Session) -> Array:

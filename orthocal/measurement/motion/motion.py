@@ -12,144 +12,57 @@ reach it, it is not below a bed, the tip stays on the rod, and the dial stays in
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Literal, NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, OrthocalError, SessionError, UnreachablePathError
-from orthocal.kinematics.continuation import Failures
-from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
-from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
-from orthocal.kinematics.workspace import find_below_bed, position_at_zero
+from orthocal.errors import OrthocalError, SessionError
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
     USUAL_LENGTH,
-    approach_length,
     approach_share,
-    approach_steps,
-    fill_approach,
     name_approach,
     probing_starts,
     usual_approaches,
 )
-from orthocal.measurement.motion.guidance import range_of_expected, shown_tool, start_point
+from orthocal.measurement.motion.guidance import range_of_expected, start_point
+from orthocal.measurement.motion.paths import (
+    Path,
+    SampledPath,
+    guided_setups,
+    probed_setups,
+    require_paths,
+    sample_paths,
+    walk,
+)
+from orthocal.measurement.motion.stops import (
+    SetupMotion,
+    Stop,
+    begin_approaches,
+    find_approaches,
+    free_failure,
+    list_stops,
+    stops_on_path,
+    unguided_places,
+)
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
-from orthocal.observation.observations import build_observations, drive_table
-from orthocal.robot.model import require_tcp
-from orthocal.sensors.points import Points
+from orthocal.observation.observations import build_observations
 from orthocal.sensors.protocol import (
-    Sensor,
-    ToolPath,
     Triple,
     has_dial,
-    instrument,
-    probing_direction,
     reads_pairs,
-    tool_path,
 )
 from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM
 
-Role = Literal["alignment", "reading", "subtracted", "return"]
-
-STEP = 5e-3
-"""Largest distance between samples of a segment, [m]."""
-
 MOST_STOPS = 2000
 """Largest number of readings in one plan: two weeks of work."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Stop:
-    """Posture in which the machine stops, and the path that leads to it."""
-
-    posture: str
-    role: Role
-    """Alignment of the gauge, posture to read, posture whose reading is subtracted from the next
-    one, or return to the first posture."""
-    line: int | None
-    """Line of readings.csv; None for the alignment and the return."""
-    repeats: int | None
-    """Line of the setup's first reading, if this stop reads the first posture again."""
-    cycle: int
-    approach: str
-    """Direction of each drive at the end of the path: p if its coordinate grows, n if it falls."""
-    drives: Array
-    """Nominal drive coordinates, shape (n_drives,), [m, rad]."""
-    approach_drives: Array
-    """Drive coordinates at the start of the approach, shape (n_drives,), [m, rad]."""
-    point: Array | None
-    """Commanded tool coordinates, shape (n_coordinates,), [m]; None if the drives do not command
-    the tool."""
-    approach_point: Array | None
-    """Tool coordinates at the start of the approach, shape (n_coordinates,), [m]."""
-    via: tuple[Array, ...] = ()
-    """Tool coordinates on the path to the start of the approach, [m]: the mechanical zero if the
-    direct path is out of reach, or the corners of a path that the sensor prescribes."""
-    lift: str = ""
-    """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
-    expected: float = 0.0
-    """Reading of the nominal machine, [m], if the dial is set in the first posture or the gauge
-    zero is known."""
-    path: Array | None = None
-    """Nominal drive coordinates along the path, shape (n, n_drives), [m, rad]; None if the drives
-    do not command the tool."""
-
-    @property
-    def label(self) -> str:
-        """Line of readings.csv, or the posture of a stop without a reading."""
-        return self.posture if self.line is None else f"line {self.line}"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SetupMotion:
-    """Path through all postures of a setup, and back to the first posture."""
-
-    setup: str
-    number: int
-    """Position in the order of measurement, from 1."""
-    count: int
-    """Number of setups."""
-    alignment: Stop | None
-    """Stop in the alignment posture; None if that is the first posture of `stops`."""
-    stops: tuple[Stop, ...]
-    """Stops in the postures to read, and in the first of them again."""
-
-    @property
-    def lifting(self) -> str:
-        """Instruction for the motions during which the plunger is held up; empty without them."""
-        lifted = [s for s in self.stops if s.lift]
-        if not lifted:
-            return ""
-        places = ", ".join(dict.fromkeys(s.label for s in lifted))
-        return f"Hold the plunger up on the way to {places}: {lifted[0].lift} there."
-
-    def closing(self, stop: Stop, sensor: Sensor) -> str:
-        """Instruction for a stop that repeats the first posture; empty for other stops."""
-        if stop.repeats is None:
-            return ""
-        if isinstance(sensor, Points):
-            return f"the instrument must show the point of line {stop.repeats} again"
-        first = "0" if self.stops[0].role == "subtracted" else f"the reading of line {stop.repeats}"
-        return f"the {'dial' if has_dial(sensor) else instrument(sensor)} must show {first} again"
-
-
-class _Path(NamedTuple):
-    """Samples of a path."""
-
-    points: Array
-    """Tool coordinates, shape (n, n_coordinates), [m]."""
-    drives: Array
-    """Drive coordinates, shape (n, n_drives), [m, rad]."""
-    passive: Array
-    """Passive coordinates, shape (n, n_passive), [m, rad]."""
 
 
 def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
@@ -176,19 +89,19 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    guided, probed = _guided_setups(session), _probed_setups(session)
-    stop_at = _find_approaches(session, _unguided_places(session, {*guided, *probed}))
+    guided, probed = guided_setups(session), probed_setups(session)
+    stop_at = find_approaches(session, unguided_places(session, {*guided, *probed}))
     motions = []
     for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
         if setup in guided or setup in probed:
-            on_path = _stops_on_path(session, setup)
-            listed = _list_stops(rows, aligned_at[setup], on_path, any_side=True)
+            on_path = stops_on_path(session, setup)
+            listed = list_stops(rows, aligned_at[setup], on_path, any_side=True)
             if setup in guided:
                 stops = _follow_path(session, setup, listed, guided[setup])
             else:
                 stops = _probe_stops(session, setup, listed, probed[setup])
         else:
-            stops = _list_stops(rows, aligned_at[setup], stop_at)
+            stops = list_stops(rows, aligned_at[setup], stop_at)
             if session.robot.commands_tool:
                 stops = _follow_stops(session, setup, stops)
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
@@ -201,18 +114,18 @@ def common_approach(session: Session) -> str | None:
 
     It is also None if no effect of the machine depends on the approach.
     """
-    places = _unguided_places(session, {*_guided_setups(session), *_probed_setups(session)})
+    places = unguided_places(session, {*guided_setups(session), *probed_setups(session)})
     if not places or not usual_approaches(session.robot):
         return None
     for letter in "pn":
-        if _free_failure(_begin_approaches(session, places, letter)[1]) is None:
+        if free_failure(begin_approaches(session, places, letter)[1]) is None:
             return letter * len(session.robot.drives)
     return None
 
 
 def state_program_approaches(session: Session) -> Session:
     """Session in which readings without a stated approach get that of programs, if possible."""
-    guided = {*_guided_setups(session), *_probed_setups(session)}
+    guided = {*guided_setups(session), *probed_setups(session)}
     if any(r.setup in guided and r.approach is None for r in session.readings):
         with suppress(OrthocalError):  # no program can be made
             session = state_path_approaches(session)
@@ -261,7 +174,7 @@ def state_path_approaches(session: Session) -> Session:
     Raises:
         SessionError: If there are too many readings, or a posture cannot be reached or approached.
     """
-    guided = {*_guided_setups(session), *_probed_setups(session)}
+    guided = {*guided_setups(session), *probed_setups(session)}
     if not guided:
         return session
     if not usual_approaches(session.robot):
@@ -279,219 +192,6 @@ def state_path_approaches(session: Session) -> Session:
     return _with_approaches(session, lambda i, _: approach_by_row.get(i))
 
 
-Path = Callable[[Array, Array], Array]
-"""Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
-
-Place = tuple[str, str | None]
-"""Posture and stated approach, which is None if not stated."""
-
-Approaches = dict[Place, Stop]
-
-
-def _guided_setups(session: Session) -> dict[str, Path]:
-    """Prescribed paths of the tool between readings, by setup, for sensors that have one."""
-    if not session.robot.commands_tool:
-        return {}
-    return {
-        name: _in_coordinates(session, path, getattr(setup.sensor, "tool", (0.0, 0.0, 0.0)))
-        for name, setup in session.setups.items()
-        if (path := tool_path(setup.sensor)) is not None
-    }
-
-
-def _probed_setups(session: Session) -> dict[str, Triple]:
-    """Directions of probes, by setup."""
-    if not session.robot.commands_tool:
-        return {}
-    return {
-        name: direction
-        for name, setup in session.setups.items()
-        if (direction := probing_direction(setup.sensor)) is not None
-    }
-
-
-def _in_coordinates(session: Session, path: ToolPath, tool: Triple) -> Path:
-    """Path between coordinates that the drives control: in space, or in the plane of motion.
-
-    Args:
-        session: The session.
-        path: Path of a tool without rotation.
-        tool: Point of the tool that follows the path, in the tool's frame, [m].
-    """
-    robot = session.robot
-    coordinates = list(require_tcp(robot).coordinates)
-    others = [k for k in range(3) if k not in coordinates]
-    normal = [np.eye(3)[others[0]]] if len(others) == 1 else []
-    fixed = position_at_zero(robot)
-
-    def between(start: Array, end: Array) -> Array:
-        ends = np.array([fixed, fixed])
-        on_path = np.array([start, end])
-        ends[:, coordinates] = on_path + rotation_shift(robot, on_path, tool)
-        corners = place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
-        if _below_bed(session, corners) and not _below_bed(session, on_path):
-            corners = place_turning(robot, path(*ends, *normal, above=True)[:, coordinates], tool)
-        return corners
-
-    return between
-
-
-def _stops_on_path(session: Session, setup: str) -> Approaches:
-    """Stops of a setup whose approaches follow from its path."""
-    robot = session.robot
-    names = list(session.postures)
-    nominal = drive_table(session) + session.active_offsets
-    tool = nominal_closure(robot).forward(nominal, names=names)
-    points = tool[:, list(require_tcp(robot).coordinates)]
-    unknown = "u" * len(robot.drives)
-    readings = [r for r in session.readings if r.setup == setup]
-    places = {(r.posture, r.approach) for r in readings}
-    places |= {(r.minus, None) for r in readings if r.minus is not None}
-    places |= {(session.alignment_postures[setup], None)}
-    index = {name: i for i, name in enumerate(names)}
-    stops = {}
-    for name, approach in places:
-        drives, point = nominal[index[name]], points[index[name]]
-        stops[name, approach] = Stop(
-            *(name, "reading", None, None, 1, approach or unknown),
-            *(drives, drives, point, point),
-        )
-    return stops
-
-
-def _unguided_places(session: Session, guided: Collection[str]) -> list[Place]:
-    """Postures to read or to align a gauge, with stated approaches, of setups without a path."""
-    ordered = (session.readings[i] for i in order_of_measurement(session.readings))
-    unguided = [r for r in ordered if r.setup not in guided]
-    first = {r.setup: r.minus or r.posture for r in reversed(unguided)}
-    aligned_at = session.alignment_postures
-    places: set[Place] = {(aligned_at[s], None) for s, p in first.items() if aligned_at[s] != p}
-    places |= {(r.posture, r.approach) for r in unguided}
-    places |= {(r.minus, None) for r in unguided if r.minus is not None}
-    order = {name: i for i, name in enumerate(session.postures)}
-    return sorted(places, key=lambda place: (order[place[0]], place[1] or ""))
-
-
-def _find_approaches(session: Session, places: Sequence[Place]) -> Approaches:
-    """Stops to read or to align a gauge, each at the end of its approach.
-
-    Postures without a stated approach are all approached from one side. The same side applies to
-    drives with the letter u.
-
-    Args:
-        session: The session.
-        places: Postures and stated approaches.
-
-    Raises:
-        SessionError: If neither side is possible in all these postures, or a posture cannot be
-            approached as stated.
-    """
-    if not places:
-        return {}
-    refused: list[ClosureError] = []
-    for letter in "pn":
-        stops, failures = _begin_approaches(session, places, letter)
-        first = _free_failure(failures)
-        if first is not None:
-            refused.append(first)
-            continue
-        for (name, stated), error in failures.items():
-            raise SessionError(
-                f"cannot be approached as stated ({stated}) by {approach_length(session)}: "
-                f"{error.reason}",
-                where=f"{session.path or 'session'}: postures.{name}",
-            )
-        return stops
-    raise SessionError(
-        "can be approached neither from below nor from above by "
-        f"{approach_length(session)}: {refused[0].reason}",
-        where=f"{session.path or 'session'}: postures.{refused[0].posture}",
-    )
-
-
-def _free_failure(failures: Mapping[Place, ClosureError]) -> ClosureError | None:
-    """First error of a place where the side of a drive is not stated; None without one."""
-    return next((e for (_, stated), e in failures.items() if "u" in (stated or "u")), None)
-
-
-def _begin_approaches(
-    session: Session, places: Sequence[Place], letter: str
-) -> tuple[Approaches, dict[Place, ClosureError]]:
-    """Stops of postures with their approaches.
-
-    Args:
-        session: The session.
-        places: Postures and stated approaches.
-        letter: Direction of drives without a stated one.
-
-    Returns:
-        Stops by place, and no errors; or no stops, and errors by place whose approach is out of
-        reach or below a bed.
-    """
-    robot, names = session.robot, [name for name, _ in places]
-    closure, unknown = nominal_closure(robot), "u" * len(robot.drives)
-    nominal = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    share = approach_share(session)
-    steps = [approach_steps(robot, stated or unknown, letter, share=share) for _, stated in places]
-    drives = nominal - np.array(steps)
-    failures = find_beyond_travel(robot, drives, names)
-    if not failures:
-        passive = closure.close(drives, names=names, failures=failures)
-    ends: Sequence[Array | None] = [None] * len(names)
-    starts = ends
-    if not failures and robot.commands_tool and robot.tcp is not None:
-        coordinates = list(robot.tcp.coordinates)
-        ends = list(closure.forward(nominal, names=names)[:, coordinates])
-        starts = list(closure.tcp(drives, passive)[:, coordinates])
-        for points in (ends, starts):
-            failures |= _below_bed(session, np.array(points), names)
-    if failures:
-        return {}, {places[i]: error for i, error in failures.items()}
-    approaches = [fill_approach(robot, stated, letter) for _, stated in places]
-    columns = zip(places, names, approaches, nominal, drives, ends, starts, strict=True)
-    return {
-        place: Stop(name, "reading", None, None, 1, *parts) for place, name, *parts in columns
-    }, {}
-
-
-def _list_stops(
-    rows: Sequence[tuple[int, Reading]],
-    aligned_at: str,
-    stop_at: Approaches,
-    *,
-    any_side: bool = False,
-) -> list[Stop]:
-    """Alignment of the gauge, stops in the order of measurement, and the first posture again.
-
-    Args:
-        rows: Lines and readings of the setup in this order.
-        aligned_at: Alignment posture.
-        stop_at: Stops by posture and stated approach.
-        any_side: Whether the first posture may be reached again from any side.
-    """
-    first_line, row = rows[0]
-    first = row.minus or row.posture
-    begin = stop_at[first, row.approach]
-    stops = [] if aligned_at == first else [replace(stop_at[aligned_at, None], role="alignment")]
-    for line, r in rows:
-        if r.minus is not None:
-            subtracted = replace(
-                stop_at[r.minus, None], role="subtracted", line=line, cycle=r.cycle
-            )
-            stops.append(subtracted)
-        same = (r.posture, r.approach) == (first, row.approach)
-        again = r.minus is None and same and line != first_line
-        repeats = first_line if again else None
-        stop = stop_at[r.posture, r.approach]
-        stops.append(replace(stop, line=line, repeats=repeats, cycle=r.cycle))
-    if any_side:
-        begin = replace(begin, approach="u" * len(begin.approach))
-    same_side = any_side or stops[-1].approach == begin.approach
-    if stops[-1].posture != first or not same_side:
-        stops.append(replace(begin, role="return", repeats=first_line))
-    return stops
-
-
 def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[Stop]:
     """Stops with the paths between them and the predicted readings.
 
@@ -503,14 +203,14 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
     checked, zero = list(stops), start_point(session)
     ends = [(np.asarray(s.approach_point), np.asarray(s.point)) for s in stops]
     starts = [zero, *(point for _, point in ends[:-1])]
-    paths = _sample_paths(session, [(a, *b) for a, b in zip(starts, ends, strict=True)])
+    paths = sample_paths(session, [(a, *b) for a, b in zip(starts, ends, strict=True)])
     indirect = [i for i, path in enumerate(paths) if path is None]
     if indirect:
-        through_zero = _sample_paths(session, [(starts[i], zero, *ends[i]) for i in indirect])
+        through_zero = sample_paths(session, [(starts[i], zero, *ends[i]) for i in indirect])
         for i, path in zip(indirect, through_zero, strict=True):
             paths[i], checked[i] = path, replace(checked[i], via=(zero,))
     how = ", both directly and through the mechanical zero; insert a posture between them"
-    return _predict(session, setup, checked, _require_paths(session, setup, checked, paths, how))
+    return _predict(session, setup, checked, require_paths(session, setup, checked, paths, how))
 
 
 def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path) -> list[Stop]:
@@ -529,7 +229,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
     ends = [np.asarray(others[i]) for i in (-1, 0)] if others else [first + length]
     # nothing is mounted yet: the tool comes from the last posture, or from the second one
-    possible = [np.vstack([_walk(path(first, end), length), first]) for end in ends]
+    possible = [np.vstack([walk(path(first, end), length), first]) for end in ends]
     position, begin, checked, polylines = first, first, list[Stop](), []
     for stop in stops:
         point = np.asarray(stop.point)
@@ -542,8 +242,8 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
         begin = np.asarray(arrival.approach_point)
         polylines.append([position, *arrival.via, begin, point])
         position = point
-    paths = _sample_paths(session, polylines)
-    return _predict(session, setup, checked, _require_paths(session, setup, checked, paths))
+    paths = sample_paths(session, polylines)
+    return _predict(session, setup, checked, require_paths(session, setup, checked, paths))
 
 
 def _probe_stops(
@@ -565,8 +265,8 @@ def _probe_stops(
         [points[i], starts[i], *ends]
         for i, ends in enumerate(zip(starts[1:], points[1:], strict=True))
     ]
-    sampled = _sample_paths(session, polylines, probing=True)
-    paths, checked = _require_paths(session, setup, stops, sampled), list[Stop]()
+    sampled = sample_paths(session, polylines, probing=True)
+    paths, checked = require_paths(session, setup, stops, sampled), list[Stop]()
     drives = nominal_closure(robot).inverse(starts, names=[stop.posture for stop in stops])
     for i, (stop, begin) in enumerate(zip(stops, drives, strict=True)):
         approach = name_approach(stop.drives - begin)
@@ -585,31 +285,6 @@ def _probe_stops(
 def _agree(stated: str, approach: str) -> bool:
     """True if no drive has two opposite directions in two approaches."""
     return all(a == b or "u" in (a, b) for a, b in zip(stated, approach, strict=True))
-
-
-def _require_paths(
-    session: Session,
-    setup: str,
-    stops: Sequence[Stop],
-    paths: Sequence[_Path | None],
-    remark: str = "",
-) -> list[_Path]:
-    """Paths to the stops of a setup.
-
-    Raises:
-        UnreachablePathError: If a path leaves the workspace; names the posture.
-    """
-    below = "" if session.robot.bed is None else " or goes below the bed"
-    for stop, path in zip(stops, paths, strict=True):
-        if path is None:
-            raise UnreachablePathError(
-                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace"
-                f"{below}{remark}",
-                setup=setup,
-                posture=stop.posture,
-                where=str(session.path or "session"),
-            )
-    return [path for path in paths if path is not None]
 
 
 def _arrive(
@@ -631,7 +306,7 @@ def _arrive(
     point, closure = possible[0][-1], nominal_closure(session.robot)
     approaches = []
     for corners, forwards in itertools.product(possible, (True, False)):
-        before = _walk(corners[::-1], length)
+        before = walk(corners[::-1], length)
         begin = before if forwards else 2.0 * point - before
         drives = closure.inverse(begin[None])[0]
         approach = name_approach(stop.drives - drives)
@@ -653,68 +328,8 @@ def _arrive(
     )
 
 
-def _walk(corners: Array, length: float) -> Array:
-    """Point of a polyline at a distance from its start; its end if the polyline is shorter.
-
-    Args:
-        corners: Shape (n, n_coordinates), [m].
-        length: Distance along the polyline, [m].
-    """
-    for start, end in pairwise(corners):
-        step = float(np.linalg.norm(end - start))
-        if step >= length:
-            return np.asarray(start + length / step * (end - start))
-        length -= step
-    return np.asarray(corners[-1])
-
-
-def _sample_paths(
-    session: Session, polylines: Sequence[Sequence[Array]], *, probing: bool = False
-) -> list[_Path | None]:
-    """Samples of polylines of tool coordinates; None if the machine does not reach all of one.
-
-    Args:
-        session: The session.
-        polylines: Corners of each, shape (n_coordinates,) each, [m].
-        probing: Whether a surface stops the last motion of each, so that its end may be below it.
-    """
-    robot, sampled = session.robot, [_sample(corners) for corners in polylines]
-    closure, points, failures = nominal_closure(robot), np.concatenate(sampled), Failures()
-    try:
-        drives, passive = closure.reach(points)  # cached: gauges of a leg have the same path
-    except ClosureError:
-        drives, passive = closure.reach(points, failures=failures)
-    paths, first = list[_Path | None](), 0
-    for part, corners in zip(sampled, polylines, strict=True):
-        last = first + len(part)
-        path = _Path(part, drives[first:last], passive[first:last])
-        reached = failures.keys().isdisjoint(range(first, last))
-        moved = np.array(corners[1:-1] if probing else corners[1:])
-        if reached and (find_beyond_travel(robot, path.drives) or _below_bed(session, moved)):
-            reached = False
-        paths.append(path if reached else None)
-        first = last
-    return paths
-
-
-def _below_bed(session: Session, points: Array, names: Sequence[str] | None = None) -> Failures:
-    """Rows of tool positions that the controller displays below the bed of the machine."""
-    if session.robot.bed is None:
-        return {}
-    return find_below_bed(session.robot, shown_tool(session, points), names)
-
-
-def _sample(corners: Sequence[Array]) -> Array:
-    """Points of a polyline at distances of at most STEP, shape (n, n_coordinates), [m]."""
-    segments = [corners[0][None]]
-    for start, end in pairwise(corners):
-        count = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP)))
-        segments.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
-    return np.concatenate(segments)
-
-
 def _predict(
-    session: Session, setup: str, stops: Sequence[Stop], paths: Sequence[_Path]
+    session: Session, setup: str, stops: Sequence[Stop], paths: Sequence[SampledPath]
 ) -> list[Stop]:
     """Stops with predicted readings, and with reasons to lift the plunger on their paths."""
     points, drives, passive = (np.concatenate(arrays) for arrays in zip(*paths, strict=True))

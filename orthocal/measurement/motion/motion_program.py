@@ -29,7 +29,7 @@ from orthocal.measurement.motion.guidance import (
     shown_tool,
     start_point,
 )
-from orthocal.measurement.motion.motion import SetupMotion, Stop
+from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import BallIndicator

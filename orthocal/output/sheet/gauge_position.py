@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.measurement.motion.guidance import Guidance
-from orthocal.measurement.motion.motion import SetupMotion
+from orthocal.measurement.motion.stops import SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.sensors.tips import Tip

@@ -24,8 +24,9 @@ from orthocal.measurement.motion.guidance import (
     shown_joints,
     shown_tool,
 )
-from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion
+from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
+from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.conditions import needed_conditions
 from orthocal.observation.gauge_noise import usual_difference
 from orthocal.output.sheet.gauge_position import (
