@@ -32,7 +32,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.arrays import Array, Indices, Mask
+from orthocal.arrays import Array, ArrayCache, Indices, Mask
 from orthocal.effects.loading import neutral_values
 from orthocal.effects.machine import express_machine, neutral_conditions
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
@@ -42,6 +42,10 @@ from orthocal.kinematics.se3 import exp6, right_jacobian
 from orthocal.kinematics.symbolic import Pose, moved_frames, nominal_placement
 from orthocal.robot.frames import Placement
 from orthocal.robot.model import Robot
+
+PLACEMENTS_CACHE_SIZE = 16
+"""Machines whose placements are cached: steps of a solver, loop closures and readings share them.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +180,7 @@ class ErrorMap:
         nominal = [nominal_placement(robot.model, p, frames) for p in self.moved]
         self._rotations = np.array([p.rotation for p in nominal]).reshape(-1, 3, 3)
         self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
+        self._placements = ArrayCache(PLACEMENTS_CACHE_SIZE)
 
     @property
     def n_conditions(self) -> int:
@@ -252,8 +257,16 @@ class ErrorMap:
         Returns:
             Shape (..., 12 n_moved), [1, m].
         """
-        values = self._move(self._shaped(self.twists_of(errors, commands)), slice(None))
-        return values.reshape(*values.shape[:-2], -1)
+        values = np.asarray(errors, dtype=np.float64)
+
+        def move() -> Array:
+            placed = self._move(self._shaped(self.twists_of(values, commands)), slice(None))
+            return placed.reshape(*placed.shape[:-2], -1)
+
+        if values.size > len(self.names):  # several machines
+            return move()
+        command = None if commands is None else (commands.shape, commands.tobytes())
+        return self._placements.find((values.shape, values.tobytes(), command), move)
 
     def placements_under(self, errors: Array, commands: Array) -> Array:
         """Moved placements of S machines under the conditions of V commands.

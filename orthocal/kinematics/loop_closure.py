@@ -7,14 +7,14 @@ the tool centre point to a position. `continuation` solves the equations.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
-from orthocal.arrays import Array
+from orthocal.arrays import Array, ArrayCache
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.rod_forces import RodForces
 from orthocal.errors import ClosureError
@@ -457,32 +457,10 @@ class LoopClosure:
         )
 
 
-class _ArrayCache:
-    """Cache of the most recently used arrays.
-
-    Args:
-        size: Largest number of arrays.
-    """
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._cached: dict[Hashable, Array] = {}
-
-    def find(self, key: Hashable, compute: Callable[[], Array]) -> Array:
-        """Copy of the array of a key, computed if it is not cached."""
-        array = self._cached.pop(key, None)
-        if array is None:
-            array = compute()
-        self._cached[key] = array
-        while len(self._cached) > self._size:
-            self._cached.pop(next(iter(self._cached)), None)
-        return np.array(array)
-
-
 @cached_per_robot(maxsize=8)
-def _solutions(robot: Robot) -> _ArrayCache:
+def _solutions(robot: Robot) -> ArrayCache:
     """Solutions of a robot from the reference posture, which all models of a session need."""
-    return _ArrayCache(SOLUTION_CACHE_SIZE)
+    return ArrayCache(SOLUTION_CACHE_SIZE)
 
 
 @cached_per_robot(maxsize=8)
@@ -502,7 +480,7 @@ class _UnitRodForces:
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._forces = robot, RodForces(robot)
-        self._cache = _ArrayCache(FORCE_CACHE_SIZE)
+        self._cache = ArrayCache(FORCE_CACHE_SIZE)
 
     def __call__(self, drives: Array) -> Array:
         """∂p/∂ℓ of all rods, shape (K, n_rods, 3); 0 in postures out of reach."""
