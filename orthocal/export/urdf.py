@@ -203,13 +203,10 @@ def _require_calibrated(machine: Robot, text: str) -> None:
     """
     keys = load_description(machine.yaml, content=machine.content[machine.yaml.name])
     model = load_urdf(machine.urdf, content=text.encode(), joint_types=keys.joint_types)
-    frames = {f for c in machine.closures for f in (c.frame_a, c.frame_b)}
-    frames |= {f for leg in machine.legs.values() for f in (leg.root, leg.tip)}
-    frames |= {machine.tcp.frame} if machine.tcp else set()
     pairs = list(
         zip(model.names, model.jointPlacements, machine.model.jointPlacements, strict=True)
     )
-    for frame in sorted(frames):
+    for frame in machine.frames:
         placements = (
             m.frames[find_frame(m, frame, where=str(machine.urdf))].placement
             for m in (model, machine.model)
