@@ -81,6 +81,7 @@ def identify(
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     require_conditions(session, problem.machine_selection.names)
+    _match_profiled(problem, profile)  # refused before the fit
     start_values = None if start is None else _read_start(start, problem)
     scale = AS_STATED if find_scale is None else find_scale(session)
     if chosen.base:  # without priors
@@ -88,8 +89,7 @@ def identify(
     if scale.factor != 1.0:
         selection = chosen.select(session.robot.parameters, tolerance_scale=scale)
         problem = CalibrationProblem(session, selection)
-    solve = _fit_base if chosen.base else fit_problem
-    fit = solve(problem, options=options, start=start_values)
+    fit = (_fit_base if chosen.base else fit_problem)(problem, options=options, start=start_values)
     profiled = _match_profiled(fit.problem, profile)
     calibration = assemble_calibration(fit, full_problem=problem if chosen.base else None)
     return _with_intervals(calibration, fit, profiled), session

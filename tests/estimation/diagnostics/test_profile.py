@@ -92,3 +92,9 @@ def test_without_noise_or_a_free_parameter_there_is_no_interval(experiment_2):
         identified(session, profile=["x_slide.offset"])
     with pytest.raises(ParameterError, match="no free parameter to find the interval of"):
         identified(experiment_2, profile=["x_leg.length"])
+
+
+def test_a_profiled_parameter_is_checked_before_the_fit(experiment_2):
+    with pytest.raises(ParameterError, match="no free parameter to find the interval of"):
+        # the readings do not determine these lengths without tolerances
+        identified(experiment_2, Choice("lengths", prior=False), profile=["x_slide.scale"])
