@@ -37,6 +37,7 @@ from orthocal.measurement.files.session_edits import add_alignment, add_readings
 from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
+from orthocal.measurement.motion.motion import state_possible_path_approaches
 from orthocal.measurement.recorded_rows import (
     Change,
     RecordedReading,
@@ -446,7 +447,9 @@ def _files_to_add(session: Session) -> dict[Path, bytes]:
     """
     if session.readings_path is not None or session.path is None:
         return {}
-    file, csv, table = session.path, _csv_of(session), _table(session.readings, session)
+    file, csv = session.path, _csv_of(session)
+    # as programs approach them: not asked for
+    table = _table(state_possible_path_approaches(session).readings, session)
     if exists(csv) and read_file(csv, error=SessionError) != table:
         raise SessionError(
             f"holds other rows than {file.name} plans and would be overwritten; move it away, or "

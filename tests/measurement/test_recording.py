@@ -589,6 +589,18 @@ def tracked(tmp_path):
     return tmp_path, shown.values[:24].reshape(8, 3), shown.values[24:]
 
 
+def test_readings_of_a_probe_state_the_side_of_its_motion(tmp_path):
+    """By closed form: the y_slide is at y + √(L² − x² − z²), which falls from x = 10 to 20 mm."""
+    (tmp_path / "session.yaml").write_text(
+        "robot: orthoglide\ncalibration: {effects: [backlash]}\ngauge: {sigma_mm: 0.01}\n"
+        "postures: {a: {tcp_mm: [20, 20, 20]}, b: {tcp_mm: [20, 30, 40]}}\nsetups:\n"
+        "  wall: {sensor: probe, direction: x, surface: plane, postures: [a, b]}\n"
+        "  yx: {leg: x, direction: y, section: {fraction: 0.5}, postures: [a, b]}\n"
+    )
+    with open_recording(tmp_path) as recording:
+        assert [r.approach for r in recording.rows] == ["pnn", "pnn", None, None]
+
+
 def test_points_are_recorded_three_coordinates_at_once(tracked):
     folder, points, dial = tracked
     with open_recording(folder) as recording:

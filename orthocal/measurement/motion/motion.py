@@ -125,12 +125,18 @@ def common_approach(session: Session) -> str | None:
 
 def state_program_approaches(session: Session) -> Session:
     """Session in which readings without a stated approach get that of programs, if possible."""
-    guided = {*guided_setups(session), *probed_setups(session)}
-    if any(r.setup in guided and r.approach is None for r in session.readings):
-        with suppress(OrthocalError):  # no program can be made
-            session = state_path_approaches(session)
+    session = state_possible_path_approaches(session)
     common = common_approach(session)
     return _with_approaches(session, lambda _, r: r.approach or common)
+
+
+def state_possible_path_approaches(session: Session) -> Session:
+    """Session as by `state_path_approaches`; unchanged if no program can be made."""
+    guided = {*guided_setups(session), *probed_setups(session)}
+    if any(r.setup in guided and r.approach is None for r in session.readings):
+        with suppress(OrthocalError):
+            return state_path_approaches(session)
+    return session
 
 
 def _with_approaches(session: Session, find: Callable[[int, Reading], str | None]) -> Session:
