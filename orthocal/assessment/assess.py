@@ -48,6 +48,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.measurement.files.readings_checks import require_read
 from orthocal.measurement.joining import Given
+from orthocal.session.points import count_readings
 from orthocal.session.session import Session, split_label
 
 EXPLANATIONS: tuple[FindingKind, ...] = (
@@ -224,7 +225,7 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
     findings = rank([*judgement.findings, *missing])
     if judgement.verdict == "enter":
         within = judgement.tolerance_scale.factor == 1.0
-        no_anomaly = words.no_anomaly(len(session.readings), within_tolerances=within)
+        no_anomaly = words.no_anomaly(count_readings(session), within_tolerances=within)
         findings = rank([*findings, no_anomaly])
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
     action = describe_actions(findings) or lead.action

@@ -28,6 +28,7 @@ from orthocal.effects.loading import (
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
 from orthocal.observation.observations import drive_table, readings_without
+from orthocal.session.points import count_readings
 from orthocal.session.session import Conditions, Session
 
 MAX_R_SQUARED = 0.95
@@ -69,8 +70,8 @@ def _incomplete_conditions(session: Session) -> Iterator[Finding]:
                     effect,
                     condition,
                     sorted({r.line for r in missing if r.line is not None}) if one_file else [],
-                    len(missing),
-                    len(session.readings),
+                    count_readings(session, missing),
+                    count_readings(session),
                     two_postures=any(r.minus for r in missing),
                 )
 

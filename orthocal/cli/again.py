@@ -307,7 +307,7 @@ def _plan_again(
         planned = replace(planned, robot=calibration.robot)  # its tolerances and effects
     else:
         planned = orthocal.restore_session(calibration)
-    title = planned.title.removeprefix("Simulated: ")
+    title = planned.title.removeprefix("Simulated").removeprefix(": ")
     planned = planned.with_controller(
         offsets_to_enter(orthocal.adjust_calibration(calibration, amounts))
     )

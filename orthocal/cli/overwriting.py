@@ -92,6 +92,7 @@ def _require_no_readings(directory: Path) -> None:
     """
     from orthocal.assessment.wording import counted
     from orthocal.measurement.files.session_file import load_plan
+    from orthocal.session.points import count_readings
 
     out_of_range: list[SessionError] = []
     table = directory / READINGS
@@ -100,7 +101,8 @@ def _require_no_readings(directory: Path) -> None:
     except OrthocalError:  # not a valid session
         count, path = 0, None
     else:
-        count = sum(r.is_read for r in session.readings) + len(out_of_range)
+        count = count_readings(session, [r for r in session.readings if r.is_read])
+        count += len(out_of_range)
         count = 0 if session.source.startswith(SIMULATED) else count
         path = session.readings_path
     named = path is not None and exists(table) and path.samefile(table)

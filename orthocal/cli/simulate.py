@@ -57,6 +57,7 @@ def simulate(
     """
     from orthocal.observation.sensor_groups import nuisance_parameters
     from orthocal.observation.simulate import collect_errors, drawn_gauge_errors, truth_document
+    from orthocal.session.points import count_readings
 
     require_new_session(out, FILES, force=force)
     planned = load_stated_plan(plan, effects=effects, temperature=temperature)
@@ -74,7 +75,8 @@ def simulate(
     truth = {"truth.yaml": truth_document(simulated)}
     comment = "Simulated readings, not measured. The true errors are in truth.yaml."
     path = orthocal.write_session(simulated.session, out, comment=comment, extra=truth)
-    put_note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
+    count = count_readings(simulated.session)
+    put_note(f"Wrote {path}, {count} simulated readings, and truth.yaml")
     if errors is not None:
         _report_drawn(drawn_gauge_errors(simulated, true_errors), errors, out)
 

@@ -35,6 +35,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
         read_trace,
         with_traces,
     )
+    from orthocal.session.points import count_readings
 
     require_new_session(out, FILES, force=force)
     plan = load_plan(session)
@@ -45,7 +46,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     path = orthocal.write_session(averaged, out)
     samples = sum(len(t.values) for t in by_setup.values())
     put_note(
-        f"Wrote {path}: {counted(len(averaged.readings), 'reading')}, of which the traces of "
+        f"Wrote {path}: {counted(count_readings(averaged), 'reading')}, of which the traces of "
         f"{', '.join(by_setup)} are {samples} samples"
     )
     unused = sum(t.unused_bins for t in binned.values())

@@ -21,6 +21,7 @@ from orthocal.observation.conditions import COLUMNS_OF_CONDITIONS
 from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.robot.model import Robot
 from orthocal.session.differences import Node, connect, find_leader
+from orthocal.session.points import count_readings
 from orthocal.session.session import Conditions, Reading, Session
 from orthocal.text import spans
 
@@ -470,13 +471,14 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
         if not effect.setup_errors and errors.isdisjoint(e.name for e in effect.errors):
             continue
         for condition in effect.conditions:
-            missing, total = readings_without(session, condition), len(session.readings)
-            if not missing or (len(missing) == total and not explicit):
+            missing = readings_without(session, condition)
+            if not missing or (len(missing) == len(session.readings) and not explicit):
                 continue
             problem = _missing_condition(session, condition, missing)
+            count, total = count_readings(session, missing), count_readings(session)
             raise SessionError(
                 f"{problem}. The effect '{effect.name}' needs the {condition} of each reading, "
-                f"which {len(missing)} of {total} readings do not state",
+                f"which {count} of {total} readings do not state",
                 where=session.where(missing[0]),
             )
 

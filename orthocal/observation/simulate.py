@@ -139,13 +139,20 @@ def simulate_session(
         gauges={
             name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
         },
-        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
+        title=_mark_title(plan.title),
         source=f"Simulated by orthocal, not measured (seed {seed})",
         path=None,
         readings_path=None,
         seed=seed,
     )
     return SimulatedSession(session, machine_errors, zeros, truth)
+
+
+def _mark_title(title: str) -> str:
+    """Title that begins with the word "Simulated"."""
+    if title.startswith("Simulated"):
+        return title
+    return f"Simulated: {title}" if title else "Simulated"
 
 
 def _require_readable(plan: Session, rows: Array) -> None:

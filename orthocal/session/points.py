@@ -59,6 +59,16 @@ def gather_points(readings: Sequence[Reading], setups: Mapping[str, Setup]) -> l
     return [[r for _, r in group] for _, group in groupby(enumerate(readings), line_key)]
 
 
+def count_readings(session: Session, readings: Sequence[Reading] | None = None) -> int:
+    """Number of readings as in the files: a point is one reading.
+
+    Args:
+        session: The session.
+        readings: Some of its readings in their order; by default all.
+    """
+    return len(gather_points(session.readings if readings is None else readings, session.setups))
+
+
 def one_row_per_point(session: Session) -> Session:
     """Session in which a setup of points and each of its lines are one, as in its files.
 

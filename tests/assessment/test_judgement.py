@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -34,6 +35,8 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.wording import describe_actions
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
 from orthocal.hypotheses.hypothesis import Rows
+from orthocal.measurement.files.readings_checks import describe_missing
+from orthocal.measurement.joining import join_sessions
 from orthocal.observation.gauge_noise import noise_floor
 from orthocal.output.text.answer import render_decision
 from orthocal.output.text.layout import to_text
@@ -205,6 +208,19 @@ def test_the_readings_of_an_unfinished_session_are_judged(cycles, root, tmp_path
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stdout) == (2, "")
     assert "no reading is entered yet" in done.stderr
+
+
+def test_missing_readings_of_joined_sessions_have_lines_of_their_files(experiment_2):
+    def unread(label, *rows):
+        file = Path(label) / "readings.csv"
+        readings = [replace(r, line=i + 2) for i, r in enumerate(experiment_2.readings)]
+        for i in rows:
+            readings[i] = replace(readings[i], value=math.nan)
+        return replace(experiment_2, readings=tuple(readings), readings_path=file)
+
+    session = join_sessions([unread("a", 3), unread("b", 1, 3)])
+    places = "a/readings.csv: line 5; b/readings.csv: lines 3, 5"
+    assert describe_missing(session) == f"3 of 12 readings are missing ({places})"
 
 
 def test_the_next_step_of_a_decision_is_about_each_finding(cycles):

@@ -76,6 +76,19 @@ def test_readings_are_coordinates_of_the_target_in_the_station(tmp_path):
         assert abs(found[row] - expected) < CLOSED_FORM
 
 
+def test_a_point_is_one_reading_in_all_answers(tmp_path):
+    session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=1).session
+    assert session.title == "Simulated"  # the plan has none
+    lines = [replace(r, line=i // 3 + 2) for i, r in enumerate(session.readings)]
+    found = check_session(replace(session, readings=tuple(lines)), judgement=SOUND)
+    assert found.of_kind("no anomaly")[0].numbers == {"readings": 8.0}
+    lines[3:6] = [replace(r, value=np.nan) for r in lines[3:6]]
+    found = check_session(replace(session, readings=tuple(lines)), judgement=SOUND)
+    (missing,) = found.of_kind("readings missing")
+    assert missing.numbers == {"readings": 8.0, "missing": 1.0}
+    assert missing.text == "1 of 8 readings is missing (line 3)."
+
+
 def test_the_station_is_that_of_scipy():
     rng = np.random.default_rng(0)
     points, turned = rng.normal(size=(7, 3)), Rotation.from_rotvec([2.0, -0.4, 1.0])

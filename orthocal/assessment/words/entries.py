@@ -19,6 +19,7 @@ from orthocal.calibration.assessment_record import (
 from orthocal.kinematics.conditions import StatedUse
 from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.robot.model import Drive, drive_keys
+from orthocal.session.points import count_readings
 from orthocal.session.session import Session
 from orthocal.text import capitalised
 from orthocal.units import UM, format_fixed
@@ -95,14 +96,14 @@ def no_anomaly(readings: int, *, within_tolerances: bool) -> Finding:
 
 def readings_missing(session: Session) -> Finding:
     """Finding that some readings are missing."""
-    missing = [i for i, r in enumerate(session.readings) if not r.is_read]
+    missing = {i: r for i, r in enumerate(session.readings) if not r.is_read}
     return note(
         "readings missing",
         f"{describe_missing(session)}.",
         "Record them with `orthocal record`, or delete their lines there (`drop`).",
-        [place_of(session, i) for i in missing[:MAX_PLACES]],
-        readings=float(len(session.readings)),
-        missing=float(len(missing)),
+        [place_of(session, i) for i in [*missing][:MAX_PLACES]],
+        readings=float(count_readings(session)),
+        missing=float(count_readings(session, [*missing.values()])),
     )
 
 

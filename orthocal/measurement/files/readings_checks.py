@@ -28,6 +28,7 @@ from orthocal.sensors.protocol import (
 )
 from orthocal.session.completeness import require_name
 from orthocal.session.differences import IndependentReadings
+from orthocal.session.points import count_readings
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten, spans
 from orthocal.units import MM
@@ -142,13 +143,23 @@ def require_read(session: Session, *, partial: bool = False) -> None:
 def describe_missing(session: Session) -> str:
     """Number and lines of missing readings.
 
-    For example "9 of 24 readings are missing (lines 14, 17 to 24)".
+    For example "9 of 24 readings are missing (lines 14, 17 to 24)". Lines of joined sessions follow
+    the name of their file.
     """
     missing = [r for r in session.readings if not r.is_read]
-    lines = sorted({r.line for r in missing if r.line is not None})
-    where = f" ({spans(lines, 'line')})" if lines else ""
-    verb = "is" if len(missing) == 1 else "are"
-    return f"{len(missing)} of {len(session.readings)} readings {verb} missing{where}"
+    lines: dict[Path | None, set[int]] = {}
+    for r in missing:
+        if r.line is not None:
+            lines.setdefault(r.file, set()).add(r.line)
+    places = "; ".join(
+        f"{'' if file is None else f'{file}: '}{spans(sorted(numbers), 'line')}"
+        for file, numbers in lines.items()
+    )
+    count = count_readings(session, missing)
+    return (
+        f"{count} of {count_readings(session)} readings {'is' if count == 1 else 'are'} missing"
+        + (f" ({places})" if places else "")
+    )
 
 
 def parse_row(row: RawReading, session: Session, points: PointRows) -> list[Reading]:

@@ -14,6 +14,7 @@ from orthocal.errors import ParameterError
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
+from orthocal.session.points import count_readings
 from orthocal.session.session import Session, Setup, known_approach
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -161,7 +162,7 @@ def measurement_of_session(session: Session) -> Measurement:
             if name is not None
         },
         rows=measure_deviations(session),
-        count=len(session.readings),
+        count=count_readings(session),
         largest_after=None,
         planned=not np.isfinite(session.values).any(),
     )
