@@ -182,8 +182,8 @@ class BallBar(ToolSensor):
             end: Last tool centre point, shape (3,), [m].
             normal: Unit normal of the plane in which the tool moves, shape (3,); None for a tool
                 that moves in space, along a great arc.
-            above: Whether the path must not be lower than its lower end. Azimuth and elevation then
-                change evenly.
+            above: Whether the path must not be lower than its lower end, unlike the shorter arc. In
+                space azimuth and elevation then change evenly; in a plane it is the other arc.
 
         Returns:
             Tool centre points, shape (n, 3), [m]. Chords deviate from the arc by at most `SAGITTA`.
@@ -200,7 +200,7 @@ class BallBar(ToolSensor):
         def shares(angle: float) -> Array:
             return np.linspace(0.0, 1.0, max(math.ceil(angle / step), 1) + 1)[:, None]
 
-        if above:
+        if above and normal is None:
             polar = np.array([[np.arctan2(y, x), np.arcsin(z)] for x, y, z in (first, last)])
             motion = polar[1] - polar[0]
             motion[0] = math.remainder(motion[0], 2.0 * np.pi)
@@ -218,7 +218,9 @@ class BallBar(ToolSensor):
                     across = np.cross(normal, first)
             across /= np.linalg.norm(across)
             angle = np.arctan2(abs(last @ across), first @ last)  # rounding may be negative
-            share = shares(angle)
+            if above:
+                angle -= 2.0 * np.pi
+            share = shares(abs(angle))
             unit = np.cos(share * angle) * first + np.sin(share * angle) * across
         return np.asarray((radii[0] + share * (radii[1] - radii[0])) * unit - offset)
 

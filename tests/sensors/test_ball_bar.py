@@ -235,15 +235,21 @@ def test_a_tool_that_moves_in_a_plane_stays_in_it(height, angle):
     assert length == pytest.approx(radius * np.deg2rad(angle), rel=1e-3)
 
 
-def test_a_path_above_a_bed_is_nowhere_lower_than_its_ends():
+@pytest.mark.parametrize("plane", [False, True])
+def test_a_path_above_a_bed_is_nowhere_lower_than_its_ends(plane):
     """The great arc between both leads through the lowest point of the sphere."""
     bar = BallBar((0.01, 0.02, 0.03), 0.05)
     low, side = -0.6, 0.8
     ends = [bar.centre + 0.05 * np.array([s * side, 0.0, low]) for s in (1.0, -1.0)]
-    assert bar.path(*ends)[:, 2].min() == pytest.approx(0.03 - 0.05, abs=1e-5)
-    corners = bar.path(*ends, above=True)
+    normal = [np.eye(3)[1]] if plane else []
+    assert bar.path(*ends, *normal)[:, 2].min() == pytest.approx(0.03 - 0.05, abs=1e-5)
+    corners = bar.path(*ends, *normal, above=True)
     np.testing.assert_allclose(corners[[0, -1]], ends, atol=CLOSED_FORM)
-    np.testing.assert_allclose(corners[:, 2], 0.0, atol=CLOSED_FORM)
+    assert corners[:, 2].min() > -CLOSED_FORM
+    if plane:
+        np.testing.assert_allclose(corners[:, 1], 0.02, atol=CLOSED_FORM)
+    else:
+        np.testing.assert_allclose(corners[:, 2], 0.0, atol=CLOSED_FORM)
     np.testing.assert_allclose(np.linalg.norm(corners - bar.centre, axis=1), 0.05, atol=CLOSED_FORM)
     chords = corners[1:] + corners[:-1]
     assert np.linalg.norm(0.5 * chords - bar.centre, axis=1).min() > 0.05 - 2.0 * SAGITTA

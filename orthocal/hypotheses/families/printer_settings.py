@@ -80,8 +80,8 @@ def _wrong_settings(model: LinearModel) -> Iterator[Family]:
 def _moved_bed(model: LinearModel) -> Iterator[Family]:
     """A bed with another tilt and form from a log on."""
     session = model.problem.session
-    names = model.problem.free[model.problem.n_machine :]
-    fixed = [i for i, name in enumerate(names) if name in fixed_parameters(session)]
+    names, of_printer = model.problem.free[model.problem.n_machine :], fixed_parameters(session)
+    fixed = [i for i, name in enumerate(names) if name in of_printer]
     columns = nuisance_columns(model)[fixed]
     label_of_row = [split_label(r.setup, joined=True)[0] for r in session.readings]
     explanations, groups = [], []
