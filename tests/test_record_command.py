@@ -1015,3 +1015,18 @@ def test_interrupted_recording_of_points_continues(tmp_path, run):
     assert "2 of 3 readings are missing: track lines 3, 4." in run(tmp_path, "1 2 3")[1]
     code, out, _ = run(tmp_path, "4 5 6")
     assert (code, "1 are recorded" in out, "track line 4" in out) == (0, True, True)
+
+
+def test_a_probe_has_no_rule_for_its_approach(tmp_path, run):
+    """It reaches each posture by the motion towards its surface."""
+    text = (
+        "robot: orthoglide\ngauge: {sigma_mm: 0.01}\npostures: {a: {tcp_mm: [0, 0, 0]}}\nsetups:\n"
+    )
+    for setups, stated in (
+        ("  bed: {sensor: probe, surface: plane}\n", False),
+        ("  bed: {sensor: probe, surface: plane}\n  track: {sensor: points}\n", True),
+    ):
+        folder = tmp_path / str(stated)
+        folder.mkdir()
+        (folder / "session.yaml").write_text(text + setups)
+        assert ("Approach every posture" in run(folder)[1]) == stated

@@ -19,7 +19,7 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import find_below_bed
 from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.protocol import PROBING_DISTANCE, Triple
+from orthocal.sensors.protocol import PROBING_DISTANCE, Triple, probing_direction, tool_path
 from orthocal.session.session import Posture, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
@@ -91,6 +91,22 @@ def approach_length(session: Session) -> str:
     share, units = approach_share(session), {d.unit for d in session.robot.drives}
     texts = {"m": f"{share * USUAL_LENGTH / MM:.3g} mm", "rad": f"{share * USUAL_ANGLE / DEG:.3g}°"}
     return " or ".join(text for unit, text in texts.items() if unit in units)
+
+
+def approach_rule(session: Session) -> str:
+    """AS_ARROWS_SHOW or FROM_ONE_SIDE; empty if the paths of sensors determine all approaches.
+
+    The arrows of a sensor with a path are for operators who jog; a probe has only one way.
+    """
+    approaches = [
+        r.approach
+        for r in session.readings
+        if probing_direction(sensor := session.setups[r.setup].sensor) is None
+        and (r.approach is not None or tool_path(sensor) is None)
+    ]
+    if not approaches:
+        return ""
+    return AS_ARROWS_SHOW if any(approaches) else FROM_ONE_SIDE
 
 
 def describe_approach(robot: Robot, approach: str) -> str:

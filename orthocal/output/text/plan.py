@@ -19,8 +19,8 @@ from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.measurement.motion.approach import (
     AS_ARROWS_SHOW,
-    FROM_ONE_SIDE,
     approach_length,
+    approach_rule,
     describe_approach,
 )
 from orthocal.measurement.motion.guidance import describe_mounting
@@ -46,7 +46,6 @@ from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.points import Points
 from orthocal.sensors.probe import Probe
-from orthocal.sensors.protocol import tool_path
 from orthocal.sensors.tool_indicator import ToolIndicator
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Reading, Session
@@ -285,12 +284,9 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
         words.append(
             f"Do not set the zero of {joined(nouns)} on the machine: readings are absolute."
         )
-    length = approach_length(session)
-    stated = any(r.approach for r in session.readings)
-    if any(tool_path(sensor) is None for sensor in sensors) and not stated:
-        words.append(FROM_ONE_SIDE.format(length))
-    if stated:
-        words.append(f"{AS_ARROWS_SHOW.format(length)} The programs do this.")
+    if rule := approach_rule(session):
+        programs = " The programs do this." if rule == AS_ARROWS_SHOW else ""
+        words.append(f"{rule.format(approach_length(session))}{programs}")
     return [
         *words,
         "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",

@@ -16,9 +16,8 @@ from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
 from orthocal.errors import OrthocalError
 from orthocal.measurement.motion.approach import (
-    AS_ARROWS_SHOW,
-    FROM_ONE_SIDE,
     approach_length,
+    approach_rule,
     describe_approach,
     fill_approach,
     label_reading,
@@ -205,8 +204,8 @@ class RecordingText:
         ]
         if recording.following.clock is False:
             parts.append(f"{self.clock(on=False)} `clock` changes it.")
-        rule = AS_ARROWS_SHOW if any(r.approach for r in rows) else FROM_ONE_SIDE
-        parts.append(rule.format(approach_length(session)))
+        if rule := approach_rule(replace(session, readings=rows)):
+            parts.append(rule.format(approach_length(session)))
         return "\n".join(self.wrap(part) for part in parts)
 
     def _what_to_type(self) -> str:
