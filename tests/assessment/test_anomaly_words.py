@@ -142,9 +142,15 @@ def test_the_same_line_of_another_file_is_named(session):
     first, second = (
         replace(session.readings[0], line=7, file=Path(name) / "readings.csv") for name in "ab"
     )
-    joined = replace(session, readings=(first, second))
-    both = Explanation("outlier", "reading", (0, 1))
+    joined = replace(session, readings=(first, second, session.readings[1]))
+    both = Explanation("outlier", "posture", (0, 1))
     assert "type `repeat 7`, likewise the other lines." in advise_repetition(joined, both)
+    sign = Explanation("reversed sign", "reading", (0,), factor=-1.0)
+    _, one, several = describe_alternatives(joined, sign, both).text.splitlines()
+    assert (one.count("line 7: "), several.count("line")) == (1, 0)
+    log = replace(joined, firmware=DeltaSettings("klipper", 0.14, (0.28,) * 3, (0.5,) * 3))
+    more = replace(log, readings=(*joined.readings, *(session.readings[1:2] * 4)))
+    assert "Or leave out what is wrong, and calibrate again" in advise_repetition(more, both)
 
 
 def test_lines_of_a_log_are_named_once_and_a_log_is_not_deleted(session):

@@ -343,10 +343,13 @@ def _file_of(session: Session, label: str) -> str | None:
 
 
 def _lines(session: Session, e: Explanation) -> str:
-    """Lines that an explanation concerns, such as "lines 3 and 4: "; "" if unknown or all."""
+    """Lines that an explanation concerns, such as "lines 3 and 4: ".
+
+    It is empty if the lines are unknown, those of several files, or all.
+    """
     rows = [session.readings[i] for i in e.rows]
     lines = [r.line for r in rows if r.line is not None]
-    if not lines or len(lines) == len(session.readings):
+    if not lines or len(lines) == len(session.readings) or len({r.file for r in rows}) > 1:
         return ""
     lines = sorted(set(lines))  # the three readings of a point have the same line
     file = "" if session.firmware is None else " of readings.csv"  # not lines of the log

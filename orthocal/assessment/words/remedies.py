@@ -97,7 +97,9 @@ def advise_repetition(session: Session, *explanations: Explanation) -> str:
             return f"{repeat}."
         lines = sorted({r.line for r in rows if r.line is not None})
         name = quote_path(rows[0].file) if session.joined and rows[0].file else "readings.csv"
-        omitted = f"delete {spans(lines, 'line')} of {name}" if lines else "leave it out"
+        omitted = "leave out what is wrong"
+        if lines and len({r.file for r in rows}) == 1:
+            omitted = f"delete {spans(lines, 'line')} of {name}"
         return f"{repeat}. Or {omitted}, and calibrate again."
     what = "it" if len(rows) == 1 else "these"
     file = rows[0].file or session.readings_path
