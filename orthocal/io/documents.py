@@ -419,6 +419,15 @@ UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 """Pydantic's error types for an unknown key of a model and of a dataclass."""
 
 
+KEYS_AND_VALUES = (
+    "dict_type",
+    "mapping_type",
+    "dataclass_type",
+    "model_type",
+    "model_attributes_type",
+)
+"""Pydantic's error types for a value that is no mapping."""
+
 PARSED = {"float_parsing": "a number", "int_parsing": "a whole number"}
 """Expected input by pydantic's error types for texts that are not numbers."""
 
@@ -506,7 +515,7 @@ def _describe_expected(kind: str, message: str, context: Mapping[str, Any]) -> s
     """Description of the expected input, from pydantic's error type and message."""
     if kind in PARSED:
         return PARSED[kind]
-    if kind in ("dict_type", "model_type", "dataclass_type", "mapping_type"):
+    if kind in KEYS_AND_VALUES:
         return "keys and values"
     if kind == "string_pattern_mismatch":
         return "a name without blanks, commas, semicolons or quotes"
