@@ -17,6 +17,8 @@ import pytest
 # as the command line does it, before NumPy is imported: threads of small matrices get in each
 # other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
+os.environ.setdefault("VECLIB_MAXIMUM_THREADS", "1")
 from gauges import exact
 from planned import FEW
 

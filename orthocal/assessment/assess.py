@@ -48,6 +48,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.measurement.files.readings_checks import require_read
 from orthocal.measurement.joining import Given
+from orthocal.runtime.threads import one_thread
 from orthocal.session.points import count_readings
 from orthocal.session.session import Session, split_label
 
@@ -70,6 +71,7 @@ KEEPING: dict[FindingKind, str] = {
 """Kinds of notes without anything to enter, and the headlines of the decision."""
 
 
+@one_thread()
 def calibrate(
     sessions: Given | Sequence[Given],
     choice: Choice | str | None = None,
@@ -206,6 +208,7 @@ def gains_from_correction(calibration: Calibration, tool: ToolErrorSummary | Non
     )
 
 
+@one_thread()
 def check_session(session: Session, *, judgement: Judgement | None = None) -> Assessment:
     """Assess readings before anything is calibrated from them.
 

@@ -28,6 +28,7 @@ from orthocal.estimation.weighting import split_by_gauge, with_repeatability
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions, require_same_robot
+from orthocal.runtime.threads import one_thread
 from orthocal.session.session import Session
 from orthocal.statistics.noise import Noise, estimate_noise
 
@@ -116,6 +117,7 @@ class Comparison:
         return format_json(document)
 
 
+@one_thread()
 def compare_models(
     sessions: Given | Sequence[Given],
     *,

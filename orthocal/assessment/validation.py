@@ -64,6 +64,7 @@ from orthocal.measurement.joining import (
     on_one_printer,
     require_same_tolerances,
 )
+from orthocal.runtime.threads import one_thread
 from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE
 from orthocal.units import MM
@@ -213,6 +214,7 @@ def _is_expected(p_value: float) -> bool | None:
     return None if math.isnan(p_value) else p_value >= BY_CHANCE
 
 
+@one_thread()
 def validate_calibration(
     calibration: Calibration,
     sessions: Given | Sequence[Given],

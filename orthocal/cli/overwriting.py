@@ -135,7 +135,8 @@ def write_plan(
     from orthocal.measurement.files.write_session import write_session
 
     path = write_session(session, directory, comment=comment, extra=files, blank=True)
-    others = [directory / "sheet.html", directory / "plan.json", *directory.glob("[0-9]*-*.ngc")]
+    others = [directory / "sheet.html", directory / "plan.json"]
+    others += [p for ending in ("ngc", "txt") for p in directory.glob(f"[0-9]*-*.{ending}")]
     old = sorted(p for p in others if p.name not in files and exists(p) and _is_marked(p))
     old += [p for p in (q.with_suffix(".svg") for q in old if q.suffix == ".json") if exists(p)]
     for file in old:

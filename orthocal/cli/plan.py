@@ -238,7 +238,8 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path, calibrating: str) -> N
     put_note(problem)
     files = {"plan.json": plan_json(plan), "plan.svg": figure, **sheet}
     path = write_plan(plan.session, directory, comment=comment, files=files)
-    sheet_names = ", sheet.html and its programs" if sheet else ""
+    programs = "programs" if plan.session.firmware is None else "lines to send"
+    sheet_names = f", sheet.html and its {programs}" if sheet else ""
     put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{sheet_names}")
 
 

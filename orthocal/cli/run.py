@@ -20,6 +20,7 @@ from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError
 from orthocal.runtime.interrupts import INTERRUPTED, ending_at_interrupt
 from orthocal.runtime.streams import ReaderGoneError, announced_if_slow, guarded_streams
+from orthocal.runtime.threads import state_one_thread
 from orthocal.text import printable
 
 PANELS = {
@@ -49,8 +50,7 @@ def main() -> None:
     3 the verdict is `review` or `reject`, a calibration is not confirmed, or some rows of a table
     cannot be reached; 70 a bug of orthocal; 130 Ctrl-C.
     """
-    # with small matrices, more threads are slower
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    state_one_thread()
     # otherwise pydantic searches all installed packages for plugins
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     with guarded_streams(), ending_at_interrupt():

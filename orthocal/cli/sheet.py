@@ -55,7 +55,8 @@ def sheet(
     count = len(files) - 1
     programs = "; no programs: the drives control no tool"
     if count:
-        programs = f" and {counted(count, 'program')}"
+        noun = "program" if plan.firmware is None else "file"
+        programs = f" and {counted(count, noun)}{' of lines to send' * (noun == 'file')}"
     put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
     note_beyond_limits(plan, ini)
 

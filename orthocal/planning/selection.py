@@ -15,7 +15,6 @@ from itertools import chain, zip_longest
 from typing import cast
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError
@@ -23,6 +22,7 @@ from orthocal.planning.candidates import MIN_READINGS, AlignedParameter, Candida
 from orthocal.planning.information_gain import Gain, Pairs, PointGain, SetupGain
 from orthocal.planning.ranking import first_largest, is_less, sort_by
 from orthocal.planning.setup_stack import SetupStack, stack_setups
+from orthocal.runtime.threads import one_thread
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
 
@@ -226,7 +226,7 @@ class SetupSearch:
 
     def run(self, start: _Start) -> PlannedSetups:
         """Add the setups of one start one by one, then exchange them."""
-        with threadpool_limits(1):  # on several threads sums may be rounded differently
+        with one_thread():
             plan = self.empty
             for count, drawn in start:
                 plan = self.extend(plan, drawn or self._find_best(plan.information, count))

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.cost_curve import HOUR, find_scale
@@ -20,6 +18,7 @@ from orthocal.planning.selection import SetupSearch
 from orthocal.planning.timed_search import TimedSearch
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.robot.model import Robot
+from orthocal.runtime.threads import one_thread
 from orthocal.session.session import Gauge, Session
 from orthocal.units import UM
 
@@ -106,7 +105,7 @@ def find_sensor_gains(
     gains = []
     for name, duration in equipment.durations(listed).items():
         timed = TimedSearch(search, {name: duration})
-        with threadpool_limits(1):
+        with one_thread():
             plan = timed.fill(search.empty, HOUR)
         if plan.setups:
             gains.append(

@@ -14,8 +14,6 @@ from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
-from threadpoolctl import threadpool_limits
-
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import MIN_READINGS
 from orthocal.planning.owned_sensors import SLACK, Duration
@@ -30,6 +28,7 @@ from orthocal.planning.selection import (
     PlannedSetups,
     SetupSearch,
 )
+from orthocal.runtime.threads import one_thread
 from orthocal.runtime.worker_pool import run_in_parallel
 
 READINGS = (2, 3, 4, 6, 9, 12, 16, 24, 32, 48, 64, 96)
@@ -143,7 +142,7 @@ class TimedSearch:
         """
         setups = []
         if first is not None:
-            with threadpool_limits(1):  # on several threads sums may be rounded differently
+            with one_thread():
                 options = self._list_options(self.search.empty, 0.5 * minutes)
             of_gauge = [o for o in options if self._gauge(o.planned) == first]
             if of_gauge:
@@ -152,7 +151,7 @@ class TimedSearch:
 
     def improve(self, setups: Sequence[PlannedSetup], minutes: float) -> PlannedSetups:
         """Plan with these setups and further ones, exchanged for better ones within a time."""
-        with threadpool_limits(1):
+        with one_thread():
             plan = self.fill(self.search.plan_of(setups), minutes)
             plan = self._exchange_all(plan, minutes, together=1)
             if len(plan.setups) > MAX_PAIRED_SETUPS:

@@ -156,7 +156,7 @@ class BallBar(ToolSensor):
         if self.ball is not None:
             stays = (
                 " If it stays from an earlier setup, leave it, and jog around ball and post to the "
-                "alignment posture before you start the program."
+                "alignment posture before you start."
             )
         return (
             "Mount one ball at the tool. Place the other, the fixed ball, on its post only after "

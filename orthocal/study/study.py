@@ -14,7 +14,6 @@ from operator import attrgetter
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
 from orthocal.arrays import Array
@@ -24,6 +23,7 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.measurement.files.point_rows import is_of_row
 from orthocal.measurement.files.write_session import session_document, session_tables
 from orthocal.robot.model import Robot
+from orthocal.runtime.threads import one_thread
 from orthocal.sensors.points import Points
 from orthocal.session.session import Session
 
@@ -135,7 +135,7 @@ def _session_record(session: Session) -> dict[str, Any]:
 
 def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
     """Compute the rows of one task as they are stored, on one thread and with rounded numbers."""
-    with threadpool_limits(1):
+    with one_thread():
         columns = study.run(prepare_once(study), task)
     return {name: _round_column(cells) for name, cells in columns.items()}
 

@@ -158,7 +158,8 @@ def test_deviations_with_priors_are_as_large_as_expected():
         sizes.append((expected.rms, refit.rms_before, expected.largest, refit.largest_before))
     rms, achieved, median, largest = np.array(sizes).T
     ratio = np.sqrt(np.mean(achieved**2) / np.mean(rms**2))
-    assert ratio == pytest.approx(1.0, abs=0.3)  # three standard deviations
+    error = 0.5 * np.std(achieved**2) / np.mean(achieved**2) / np.sqrt(MACHINES)  # of the ratio
+    assert abs(ratio - 1.0) < 3.0 * error
     assert 0.25 < np.mean(largest < median) < 0.9  # deviations that are correlated are smaller
 
 

@@ -437,8 +437,8 @@ def test_too_many_readings_are_refused(small):
         plan_motion(replace(small, readings=many))
 
 
-def test_program_names_hold_safe_characters(motions):
-    assert [program_name(m) for m in motions] == ["01-y_x___.ngc", "02-xy.ngc"]
+def test_program_names_hold_safe_characters(small, motions):
+    assert [program_name(small, m) for m in motions] == ["01-y_x___.ngc", "02-xy.ngc"]
 
 
 RESET = ["G92.1", "G49", *(f"G10 L2 P{k} X0 Y0 Z0 R0" for k in (1, 2)), "G54 G90 G21 G17"]

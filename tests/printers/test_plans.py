@@ -55,20 +55,25 @@ def test_a_plan_from_a_log_states_its_controller(printer, tmp_path):
     assert str(e.value.where).endswith("bar/session.yaml: controller.firmware")
 
 
-def test_programs_of_a_printer_have_the_coordinates_of_its_firmware(printer):
+def test_lines_to_send_have_the_coordinates_of_the_firmware(printer):
     """The name of a posture is where the firmware is sent. The drives are those it moves to."""
     log, plan = printer
-    programs = "".join(t for n, t in sheet_files(plan).items() if n.endswith(".ngc"))
+    files = sheet_files(plan)
+    lines = "".join(t for n, t in files.items() if n.endswith(".txt"))
+    assert not re.search(r"G53|M0|M2|MSG", lines)  # no firmware runs these
+    assert not [name for name in files if name.endswith(".ngc")]
+    assert "program" not in re.sub(r"<svg.*?</svg>", "", files["sheet.html"], flags=re.DOTALL)
+    assert "a_slide" not in files["sheet.html"]
     checked = 0
     for name, posture in plan.postures.items():
         shift = dict(re.findall(r"([xyz])([-+][\d.]+)", name))
         point = np.array([float(shift.get(k, 0.0)) for k in "xyz"])
         there = log.firmware.forward(posture.drives)[0] / MM
         assert np.abs(there - point).max() < 1e-3  # of the name
-        line = r"posture {}[;)].*\n(?:G53.*\n)*G53 G1 X(.*) Y(.*) Z(.*) F120"
-        for words in re.findall(line.format(re.escape(name)), programs):
+        line = r"posture {}\n(?:G1 .*\n)*G1 X(.*) Y(.*) Z(.*) F120"
+        for words in re.findall(line.format(re.escape(name)), lines):
             assert np.abs(np.array(words, float) - there).max() < 1e-4
             checked += 1
     assert checked >= len(plan.readings)
-    heights = [float(z) for z in re.findall(r"(?m)^G53 .* Z(.*) F", programs)]
+    heights = [float(z) for z in re.findall(r"(?m)^G1 .* Z(.*) F", lines)]
     assert min(heights) > -CLOSED_FORM

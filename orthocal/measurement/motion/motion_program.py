@@ -8,8 +8,9 @@ program also pauses before this motion, and starts in the first posture if the b
 With a probe it pauses above each posture, where the operator probes.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
-coordinate rotation have no effect. Coordinates are those of nominal kinematics, or of
-the settings of a printer's firmware; comments list the joints.
+coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
+joints. The firmware of a printer does not run these programs: it has other pauses, and macros that
+move the nozzle at a pause. Its operator sends the lines of one reading after the other.
 """
 
 from __future__ import annotations
@@ -69,6 +70,12 @@ PREAMBLE = (
     "G21 G90 G94 G40 G49",
 )
 
+LINES_HEAD = [
+    "; Written by orthocal: lines to send",
+    "; Send the lines of one reading after the other from the console of the firmware.",
+    "; Do not run this file: it has no pauses.",
+]
+
 SIGNS = str.maketrans("↑↓·", "+-0")
 """Arrows of an approach in ASCII."""
 
@@ -126,10 +133,27 @@ class ProgramOptions:
         return [*lines, f"M64 P{self.trigger}", f"G4 P{PULSE_TIME:g}", f"M65 P{self.trigger}"]
 
 
-def program_name(motion: SetupMotion) -> str:
-    """File name of a setup's program: its number, then its name in safe characters."""
+def program_name(session: Session, motion: SetupMotion) -> str:
+    """File name of a setup's program: its number, then its name in safe characters.
+
+    Lines for a printer have the ending txt, because no printer may run them as a file.
+    """
     safe = re.sub(r"[^A-Za-z0-9_-]", "_", motion.setup)[:LONGEST_NAME]
-    return f"{motion.number:02d}-{safe}.ngc"
+    return f"{motion.number:02d}-{safe}.{'ngc' if session.firmware is None else 'txt'}"
+
+
+def write_lines(
+    session: Session, motion: SetupMotion, options: ProgramOptions | None = None
+) -> str:
+    """Lines that the operator of a printer sends, reading by reading.
+
+    The arguments are those of `write_program`.
+    """
+    options, sensor = options or ProgramOptions(), session.setups[motion.setup].sensor
+    stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
+    blocks = [LINES_HEAD]
+    blocks += [[f"; {_label(s)}", *_moves(session, sensor, s, options)] for s in stops]
+    return "\n\n".join("\n".join(block) for block in blocks) + "\n"
 
 
 def write_program(
@@ -153,9 +177,8 @@ def write_program(
         )
     of_setup = session.setups[motion.setup]
     sensor = of_setup.sensor
-    read, probed = "read", probing_direction(sensor) is not None
-    aligned = session.alignment_postures[motion.setup]
-    if probed:  # by the operator
+    read, aligned = "read", session.alignment_postures[motion.setup]
+    if probing_direction(sensor) is not None:  # the operator probes
         read = "probe, note the trigger, move back"
         options = replace(options, dwell=None, trigger=None)
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
@@ -184,7 +207,7 @@ def write_program(
         side = "; approach " + describe_approach(robot, stop.approach).translate(SIGNS)
         lines += [
             f"({_label(stop)}{side if stated else ''}; joints {_joints(robot, stop)})",
-            *_moves(session, stop, options, probed=probed),
+            *(f"G53 {move}" for move in _moves(session, sensor, stop, options)),
             f"(MSG, {_label(stop)}: {instruction})",
         ]
         following = stops[i + 1] if i + 1 < len(stops) else None
@@ -275,13 +298,13 @@ def _read(
     return [*lines, *hold, "M0"] if hold else lines
 
 
-def _moves(session: Session, stop: Stop, options: ProgramOptions, *, probed: bool) -> list[str]:
+def _moves(session: Session, sensor: Sensor, stop: Stop, options: ProgramOptions) -> list[str]:
     """Motion to the start of the approach, and the approach unless the operator probes."""
     targets: list[tuple[Array | None, float]] = [(point, options.feed) for point in stop.via]
     targets.append((stop.approach_point, options.feed))
-    if not probed:  # the operator moves a probe until it triggers
+    if probing_direction(sensor) is None:
         targets.append((stop.point, options.approach_feed))
-    return [f"G53 G1 {_words(session, point)} F{feed:g}" for point, feed in targets]
+    return [f"G1 {_words(session, point)} F{feed:g}" for point, feed in targets]
 
 
 def _words(session: Session, point: Array | None) -> str:

@@ -25,7 +25,12 @@ from orthocal.measurement.motion.guidance import (
     shown_tool,
 )
 from orthocal.measurement.motion.motion import plan_motion
-from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
+from orthocal.measurement.motion.motion_program import (
+    ProgramOptions,
+    program_name,
+    write_lines,
+    write_program,
+)
 from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.conditions import needed_conditions
 from orthocal.observation.gauge_noise import usual_difference
@@ -81,6 +86,9 @@ REMOVE_BAR = (
 )
 """The same for a ball bar."""
 
+REMOVE_FROM_PRINTER = "Then remove the gauge. A fixed ball stays if a later setup uses it."
+"""The same for a printer, which begins the next setup where it stands."""
+
 BALL_IN_THE_WAY = (
     " The fixed ball of a ball bar and its post may be in its way. Place them only after the tool "
     "stands in the first posture. Where they stay for a later setup with the same ball, jog around "
@@ -94,6 +102,31 @@ PROBING = (
     f"{PROBING_DISTANCE / MM:g} mm before each posture, and you probe."
 )
 """Rule for the approach of postures that are probed."""
+
+CHECKS_OF_PRINTER = [
+    "Warm the printer up and home it. The firmware must have the settings that session.yaml states "
+    "(`controller`). Do not change them until all readings are taken.",
+    "Switch the mesh of the bed and other corrections of the height off (Klipper: BED_MESH_CLEAR, "
+    "Marlin: M420 S0, RepRapFirmware: G29 S2), and set G90 and G21.",
+    "Copy the lines of one reading after the other from the file of the setup (lines to send) into "
+    "the console of the firmware. Nothing may be in the way of the first motion of a setup. Mount "
+    "the gauge after it.",
+    "Check each rod and each hinge for play that the dial shows, and remove it: the calibration "
+    "cannot correct it.",
+]
+"""Checks of a printer."""
+
+LINES_APPROACH = (
+    "Send all lines of a reading in their order: the last one approaches the posture from the "
+    "right side."
+)
+"""Rule for the approach of postures on a printer."""
+
+PROBED_BY_HAND = (
+    f"The lines of a probe stop {PROBING_DISTANCE / MM:g} mm before the posture. Then move the "
+    "probe towards the surface until it triggers."
+)
+"""The same for postures that are probed."""
 
 BY_EYE = 0.01
 """Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
@@ -121,8 +154,9 @@ def sheet_files(
     session = one_row_per_point(session)
     motions = plan_motion(session)
     programs: dict[str, str] = {}
+    write = write_program if session.firmware is None else write_lines
     if all(stop.point is not None for motion in motions for stop in motion.stops):
-        programs = {program_name(m): write_program(session, m, options) for m in motions}
+        programs = {program_name(session, m): write(session, m, options) for m in motions}
     visuals = load_visuals(session.robot)
     links = tuple(dict.fromkeys(v.link for v in visuals))
     guidance = guide(session)
@@ -157,33 +191,18 @@ def _front(
     several = len(session.gauges_with_readings) > 1
     headers = (
         *("", "setup", "measures", *(["gauge"] if several else []), "readings"),
-        *(["program"] if with_programs else []),
+        *(["program" if session.firmware is None else "lines to send"] if with_programs else []),
     )
     rows, aligned_at = [], session.alignment_postures
     for m in motions:
         count = str(sum(s.role == "reading" for s in m.stops))
         setup = session.setups[m.setup]
         gauge = (setup.gauge,) if several else ()
-        program = (program_name(m),) if with_programs else ()
+        program = (program_name(session, m),) if with_programs else ()
         measured = describe_mounting(setup.sensor, aligned_at[m.setup])
         rows.append((str(m.number), m.setup, measured, *gauge, count, *program))
-    normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
-    checks = [
-        "Warm the machine up. Home it once. Do not home it again until all readings are taken. If "
-        "you must home it again, repeat the interrupted setup.",
-        f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
-        f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
-        f"differs by more than {_largest_difference(robot)}, the zero of the joint, a dimension or "
-        "the direction of counting is wrong. Correct the zero in the controller (LinuxCNC: "
-        "HOME_OFFSET), or the others in machine.yaml (`orthocal new DIRECTORY --again`). From now "
-        "on, drive to the numbers printed here, not by eye. Travel of the joints: "
-        f"{'; '.join(_travel(session))}.",
-        f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
-        _active_offsets(session),
-        *([text] if (text := _compensation(session)) else []),
-        "Check each rod and each hinge for play that the dial shows, and remove it: the "
-        "calibration cannot correct it.",
-    ]
+    checks = _checks_of_machine(session) if session.firmware is None else CHECKS_OF_PRINTER
+    programs = with_programs and session.firmware is None
     blanks = "".join(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
         for text in ("Date, name", *_asked_once(session))
@@ -199,8 +218,30 @@ def _front(
         + _numbered(_reading_rules(session, motions))
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3 + several)
-        + (_programs(session, options, with_bar=with_bar) if with_programs else "")
+        + (_programs(session, options, with_bar=with_bar) if programs else "")
     )
+
+
+def _checks_of_machine(session: Session) -> list[str]:
+    """Checks of a machine whose drives are joints of its controller."""
+    robot = session.robot
+    normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
+    return [
+        "Warm the machine up. Home it once. Do not home it again until all readings are taken. If "
+        "you must home it again, repeat the interrupted setup.",
+        f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
+        f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
+        f"differs by more than {_largest_difference(robot)}, the zero of the joint, a dimension or "
+        "the direction of counting is wrong. Correct the zero in the controller (LinuxCNC: "
+        "HOME_OFFSET), or the others in machine.yaml (`orthocal new DIRECTORY --again`). From now "
+        "on, drive to the numbers printed here, not by eye. Travel of the joints: "
+        f"{'; '.join(_travel(session))}.",
+        f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
+        _active_offsets(session),
+        *([text] if (text := _compensation(session)) else []),
+        "Check each rod and each hinge for play that the dial shows, and remove it: the "
+        "calibration cannot correct it.",
+    ]
 
 
 def _largest_difference(robot: Robot) -> str:
@@ -249,20 +290,24 @@ def _setup(
     with_program: bool,
 ) -> str:
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
-    program = f" Program: {program_name(motion)}." if with_program else ""
+    printer = session.firmware is not None
+    noun = "Lines to send" if printer else "Program"
+    program = f" {noun}: {program_name(session, motion)}." if with_program else ""
     sensor, name = session.setups[motion.setup].sensor, session.setups[motion.setup].gauge
     measured = describe_mounting(sensor, gauge.alignment)
     if session.distinguish_gauge(name):
         measured += f". Gauge: {_gauge(name, session.gauges[name])}"
     at_zero = "" if gauge.leg is None or is_displaced(sensor) else "At the mechanical zero: "
     end = _compare_closing(session, motion)
-    end += REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
+    remove = REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
+    end += REMOVE_FROM_PRINTER if printer else remove
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
         f"{paragraph(f'{at_zero}{measured}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
         f"{_numbered(_steps(session, motion, gauge))}"
-        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(end)}</section>"
+        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(end)}"
+        "</section>"
     )
 
 
@@ -284,13 +329,12 @@ def _compare_closing(session: Session, motion: SetupMotion) -> str:
 def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:
     """Steps before the readings of a setup."""
     first = motion.stops[0]
-    start = f"{first.posture}: {_joint_list(session.robot, first.drives)}"
-    go = [f"Move to the first posture, {start}."]
+    go = [f"Move to the first posture, {first.posture}: {_place(session, first.drives)}."]
     align = "Move to the alignment posture"
     if gauge.alignment == first.posture:
         align, go = f"{align}, which is also the first posture", []
     to_alignment = [
-        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}."
+        f"{align}, {gauge.alignment}: {_place(session, gauge.drives)}."
         f"{_around_ball(session, gauge.setup, motion.alignment or first)}"
     ]
     if probing_direction(gauge.setup.sensor) is not None:  # nothing is aligned on the surface
@@ -346,7 +390,7 @@ def _around_ball(session: Session, setup: Setup, begin: Stop) -> str:
     at = ", ".join(_short(v) for v in shown_tool(session, begin.point[None])[0])
     return (
         " If the fixed ball is in place already, jog around ball and post to this posture (tool at "
-        f"{at} mm) before you start the program."
+        f"{at} mm) before you start."
     )
 
 
@@ -397,8 +441,12 @@ def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> st
 
 
 def _boxes(session: Session, motion: SetupMotion) -> str:
-    """Table of the readings: line, posture, tool, joints, and a box to write into."""
+    """Table of the readings: line, posture, tool, joints, and a box to write into.
+
+    The firmware of a printer does not show its carriages.
+    """
     robot = session.robot
+    joints = robot.drives if session.firmware is None else ()
     tool = motion.stops[0].point is not None
     approaches = any(r.approach for r in session.readings)
     to_note = _asked_for_each(session)
@@ -411,7 +459,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         ("posture", ""),
         *([("approach", "")] if approaches else []),
         *([(f"tool {', '.join(letters)} [mm]", "")] if letters else []),
-        *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in robot.drives),
+        *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in joints),
         *([("perfect machine shows [mm]", "number")] if expected else []),
         *((f"{box} [mm]", "") for box in boxes),
         *((text, "") for text in to_note),
@@ -426,7 +474,8 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         if tool and stop.point is not None:
             shown = shown_tool(session, stop.point[None])[0]
             cells.append((", ".join(map(_short, shown)), ""))
-        cells += [(text, "number") for text in _joint_values(robot, stop.drives)]
+        if joints:
+            cells += [(text, "number") for text in _joint_values(robot, stop.drives)]
         if expected:
             cells.append((_number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
@@ -599,6 +648,8 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     robot, length = session.robot, approach_length(session)
     guided = [n for n, s in session.setups.items() if tool_path(s.sensor) is not None]
     probed = [n for n, s in session.setups.items() if probing_direction(s.sensor) is not None]
+    if session.firmware is not None:
+        return " ".join([LINES_APPROACH, *[PROBED_BY_HAND] * bool(probed)])
     motions = [m for m in motions if m.setup not in probed]
     others = [PROBING] if probed else []
     if guided and not any(r.approach for r in session.readings if r.setup in guided):
@@ -656,6 +707,14 @@ def _travel(session: Session) -> list[str]:
         if np.isfinite([low, high]).all():
             texts.append(f"{drive.name} {_number(low, 1)} to {_number(high, 1)} {unit}")
     return texts or ["no limits"]
+
+
+def _place(session: Session, drives: Array) -> str:
+    """Place of a posture as the controller displays it: its joints, or the nozzle of a printer."""
+    if session.firmware is None:
+        return _joint_list(session.robot, drives)
+    nozzle = session.firmware.forward(drives)[0]
+    return " ".join(f"{letter}{_short(v)}" for letter, v in zip("XYZ", nozzle, strict=True))
 
 
 def _joint_list(robot: Robot, drives: Array) -> str:

@@ -87,15 +87,15 @@ HOW_TO = {
     ),
     BallBar.kind: (
         "Ball bar: fix one ball on the table at the stated place and clamp the other to the tool. "
-        "Put the bar between them. The programs move along arcs around the fixed ball."
+        "Put the bar between them. The {programs} move along arcs around the fixed ball."
     ),
     ToolIndicator.kind: (
         "Indicator at the tool: clamp the dial to the tool and align the artefact with the axes of "
         "the machine by eye. It must not move until the setup is finished."
     ),
     Probe.kind: (
-        "Probe: the programs stop above each posture. Move the probe towards the surface until it "
-        "triggers. A reading is the height of the tip above the surface in the posture: the "
+        "Probe: the {programs} stop above each posture. Move the probe towards the surface until "
+        "it triggers. A reading is the height of the tip above the surface in the posture: the "
         "coordinate of the posture minus that at the trigger."
     ),
     Points.kind: (
@@ -103,7 +103,7 @@ HOW_TO = {
         "target at the tool. Read x, y and z in each posture."
     ),
 }
-"""Instructions for the kinds of sensor of a plan."""
+"""Instructions for the kinds of sensor of a plan, with what moves the machine."""
 
 OUT_OF_RANGE = "beyond the dial's range"
 
@@ -272,7 +272,8 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     session = plan.session
     sensors = [setup.sensor for setup in session.setups.values()]
     first = {sensor.kind: sensor for sensor in reversed(sensors)}
-    words = [HOW_TO[kind] for kind in HOW_TO if kind in first]
+    programs = "programs" if session.firmware is None else "lines to send"
+    words = [HOW_TO[kind].format(programs=programs) for kind in HOW_TO if kind in first]
     zeros = {setup.zero for setup in session.setups.values()}
     if "free" in zeros:
         only = " of a setup" if zeros == {"free"} else " of a setup with an indicator"
@@ -285,8 +286,8 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
             f"Do not set the zero of {joined(nouns)} on the machine: readings are absolute."
         )
     if rule := approach_rule(session):
-        programs = " The programs do this." if rule == AS_ARROWS_SHOW else ""
-        words.append(f"{rule.format(approach_length(session))}{programs}")
+        moving = f" The {programs} do this." if rule == AS_ARROWS_SHOW else ""
+        words.append(f"{rule.format(approach_length(session))}{moving}")
     return [
         *words,
         "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",

@@ -95,13 +95,16 @@ class RecordingText:
         if condition == "temperature":
             keep = "leaves it open" if temperature is None else f"keeps {temperature:g} °C"
             return f"Temperature of the machine in °C? Enter {keep}. `t 22.5` changes it later."
-        usual = approach == self.programmed_approach
+        source = "typed before"
+        if approach == self.programmed_approach:
+            printer = self._session.firmware is not None
+            source = "the lines to send do" if printer else "the programs do"
         drives = ", ".join(d.name for d in self._session.robot.drives)
         return (
             f"From which side are the postures approached? One letter for each of {drives}, or "
             "one for all: p if its drive coordinate grows at the end, n if it falls, u if unknown. "
             f"Enter: {approach} ({describe_approach(self._session.robot, approach)}), "
-            f"as {'the programs do' if usual else 'typed before'}. `side n` changes it later."
+            f"as {source}. `side n` changes it later."
         )
 
     def conditions(self, conditions: Conditions, *, alone: bool) -> str:
@@ -348,9 +351,11 @@ class RecordingText:
 
     def _coordinates(self, posture: str, name: str) -> str:
         guidance = self._guidance
-        joints = name_coordinates(self._session.robot.drives, guidance.joints[posture])
-        text = ", ".join(joint.replace(" ", GLUE) for joint in joints)
-        lines = [self.wrap(f"{name}joints {text}", indent="  ")]
+        lines = []
+        if self._session.firmware is None:
+            joints = name_coordinates(self._session.robot.drives, guidance.joints[posture])
+            text = ", ".join(joint.replace(" ", GLUE) for joint in joints)
+            lines.append(self.wrap(f"{name}joints {text}", indent="  "))
         if posture in guidance.tool:
             place = guidance.tool[posture]
             values = zip("xyz", shown_tool(self._session, place[None])[0], strict=True)
