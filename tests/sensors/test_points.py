@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import SOUND
+from calibrated import SOUND, UNJUDGED
 from commands import orthocal
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
@@ -21,6 +21,8 @@ from orthocal.measurement.files.point_rows import locate_stations
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
+from orthocal.output.text.answer import render_subject
+from orthocal.output.text.layout import to_text
 from orthocal.sensors.points import fit_station
 from orthocal.study.bootstrap import build_bootstrap_study
 from orthocal.study.sensitivity import build_sensitivity_study
@@ -80,7 +82,10 @@ def test_a_point_is_one_reading_in_all_answers(tmp_path):
     session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=1).session
     assert session.title == "Simulated"  # the plan has none
     lines = [replace(r, line=i // 3 + 2) for i, r in enumerate(session.readings)]
-    found = check_session(replace(session, readings=tuple(lines)), judgement=SOUND)
+    complete = replace(session, readings=tuple(lines))
+    text = to_text(render_subject(calibrate(complete, "offsets", **UNJUDGED)))
+    assert "Measured: 8 readings in 8 postures, 1 setup on the tool" in text
+    found = check_session(complete, judgement=SOUND)
     assert found.of_kind("no anomaly")[0].numbers == {"readings": 8.0}
     lines[3:6] = [replace(r, value=np.nan) for r in lines[3:6]]
     found = check_session(replace(session, readings=tuple(lines)), judgement=SOUND)

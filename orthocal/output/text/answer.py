@@ -30,6 +30,7 @@ from orthocal.calibration.assessment_record import (
     Verdict,
 )
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.refit import restore_session
 from orthocal.output.text.accuracy import FurtherHour, describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
@@ -45,6 +46,7 @@ from orthocal.output.text.layout import (
     table_of,
     table_of_records,
 )
+from orthocal.session.points import one_row_per_point
 from orthocal.session.session import split_label
 from orthocal.text import quote_path, uncapitalised
 from orthocal.units import DRIVE_UNITS, show_limit, tidy
@@ -378,20 +380,21 @@ def render_method(calibration: Calibration, *, effort: bool = True) -> Renderabl
 
 def _measured(calibration: Calibration) -> str:
     kind = "difference" if calibration.rows_are_differences else "reading"
-    read = {r.setup for r in calibration.residuals}
-    setups = [s for s in calibration.setups if s.name in read]
-    unread = [s.name for s in calibration.setups if s.name not in read]
+    session = one_row_per_point(restore_session(calibration))
+    read = {r.setup for r in session.readings}
+    setups = [s for s in session.setups.values() if s.name in read]
+    unread = [name for name in session.setups if name not in read]
     places = list_places(s.sensor.place for s in setups)
     sessions = len(calibration.session.parts)
     used = {
         split_label(name, joined=sessions > 0)[1]
-        for r in calibration.residuals
+        for r in session.readings
         for name in (r.posture, r.minus)
         if name
     }
     of_sessions = f" of {counted(sessions, 'session')}" if sessions else ""
     return (
-        f"Measured: {counted(len(calibration.residuals), kind)}{of_sessions} in "
+        f"Measured: {counted(len(session.readings), kind)}{of_sessions} in "
         f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
         + (f"; no reading of {', '.join(unread)}" if unread else "")
     )
