@@ -675,6 +675,14 @@ def test_wrong_values_of_options_are_refused(words, message):
     assert f"Invalid value for {message}\n" in err
 
 
+def test_exchanged_arguments_of_validate_are_named(root, tmp_path):
+    session, calibration = root / "examples/raw-cycles", tmp_path / "one"
+    calibration.mkdir()
+    (calibration / "calibration.json").write_text("{}")
+    code, _, err = orthocal("validate", session, calibration)
+    assert (code, err.endswith(f": orthocal validate {calibration} {session}\n")) == (2, True)
+
+
 def test_exchanged_arguments_of_import_are_named(root, tmp_path):
     table, session = tmp_path / "t.csv", tmp_path / "session"
     table.write_text("setup;posture;reading_mm\n")
@@ -685,6 +693,8 @@ def test_exchanged_arguments_of_import_are_named(root, tmp_path):
         f"orthocal: {table}: is no session; expected first the table, then the session: "
         f"orthocal import {table} {session}\n"
     )
+    code, _, err = orthocal("import", table, tmp_path)
+    assert (code, f"{tmp_path}: is no session; sessions there: {session}" in err) == (2, True)
     code, _, err = orthocal("import", table, tmp_path / "none")
     assert code == 2
     assert "Expected a table and a session.yaml or its directory, or a log and a new" in err

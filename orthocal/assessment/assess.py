@@ -378,7 +378,7 @@ def _entry_findings(
     if significant:
         findings.append(words.must_change(significant))
     if insignificant:
-        findings.append(words.not_significant(insignificant))
+        findings.append(words.not_significant(insignificant, keep=keep))
     return findings
 
 

@@ -12,6 +12,7 @@ from orthocal.cli.options import Json, command, read_pairs
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
+from orthocal.measurement.files.session_file import list_sessions
 from orthocal.text import printable, quote_path
 from orthocal.units import MM
 
@@ -143,6 +144,8 @@ def _require_session(table: Path, session: Path) -> None:
             f"orthocal import {quote_path(session)} {quote_path(table)}",
             where=str(session),
         )
+    if inner := list_sessions(session):
+        raise orthocal.SessionError(f"is no session{inner}", where=str(session))
     raise orthocal.SessionError(
         f"there is no session to import into, and {table} is not recognised as a printer's log; "
         "--format names its firmware. Expected a table and a session.yaml or its directory, or a "

@@ -16,6 +16,8 @@ from orthocal.cli.options import (
     read_tolerances,
 )
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
+from orthocal.io.files import exists
+from orthocal.text import quote_path
 
 
 @command()
@@ -35,6 +37,7 @@ def validate(
     Args:
         sessions (NEW_SESSION...): Measured with the entered offsets in the controller.
     """
+    _require_order(calibration, sessions)
     before = orthocal.load_calibration(calibration)
     loaded = load_each_once(sessions, tolerance=tolerance)
     require_not_calibrated(loaded, before)
@@ -42,3 +45,20 @@ def validate(
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json, details=details):
         validation = orthocal.validate_calibration(before, loaded, tolerances=tolerances)
     deliver_judged(validation, json=json, details=details, all_rows=all_rows)
+
+
+def _require_order(calibration: Path, sessions: list[Path]) -> None:
+    """Refuse a session in place of the calibration if a calibration follows.
+
+    Raises:
+        SessionError: With the command in the right order.
+    """
+    results = [s for s in sessions if exists(s / "calibration.json")]
+    if results and exists(calibration / "session.yaml"):
+        others = [calibration, *(s for s in sessions if s not in results)]
+        words = " ".join(quote_path(p) for p in (results[0], *others))
+        raise orthocal.SessionError(
+            "is a session; expected first the calibration, then its new sessions: "
+            f"orthocal validate {words}",
+            where=str(calibration),
+        )

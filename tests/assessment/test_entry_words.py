@@ -24,9 +24,12 @@ def test_a_single_reading_agrees_with_no_other(readings, within, text):
 
 def test_drives_and_verbs_have_one_number():
     assert words.must_change(ONE).text == "x_slide changes by more than its uncertainty."
-    assert words.not_significant(TWO).text == (
+    assert words.not_significant(TWO, keep=False).text == (
         "x_slide and y_slide change by less than their uncertainty. "
         "Enter all offsets together: the tool error depends on all of them."
+    )
+    assert words.not_significant(ONE, keep=True).text == (
+        "x_slide changes by less than its uncertainty."
     )
 
 

@@ -464,7 +464,10 @@ def test_later_imports_add_readings(session, orthocal):
     second = put(session, HEAD + "xy;zero;0,010\nxy;x_max;0,5\nyx;zero;1\n", None)
     code, out, _ = orthocal("import", second, session)
     assert code == 0
-    assert out.endswith("1 filled in, 1 added, 1 unchanged; 2 rows still without a reading\n")
+    assert out.endswith(
+        "1 filled in, 1 added, 1 unchanged; 2 rows still without a reading\n"
+        "In addition to the rows of the session: row 4 of the table.\n"
+    )
     rows = (session / "readings.csv").read_text().splitlines()
     assert rows[1:] == ["xy,zero,1,0.01", "xy,x_max,1,0.50", "xy,zero,2,", "xy,x_max,2,",
                         "yx,zero,1,1.00"]  # fmt: skip

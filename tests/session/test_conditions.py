@@ -30,6 +30,7 @@ from orthocal.measurement.joining import join_sessions, split_sessions
 from orthocal.measurement.recorded_rows import Change
 from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.observation.observations import build_observations
+from orthocal.output.text.import_report import format_import
 from orthocal.session.session import Conditions
 from orthocal.statistics.noise import estimate_repeatability
 from orthocal.units import MM
@@ -343,8 +344,12 @@ def test_an_import_matches_rows_with_one_stated_approach(tmp_path):
     result = imported(folder, "setup,posture,reading_mm,approach\nyx,zero,0.01,ppp\n")
     assert (result.filled, result.added) == (1, 0)
     other = write(tmp_path / "other", "setup,posture,reading_mm,approach\nyx,zero,,ppp\n")
-    result = imported(other, "setup,posture,reading_mm,approach\nyx,zero,0.01,nnn\n")
-    assert (result.filled, result.added) == (0, 1)
+    with pytest.raises(SessionError, match=r"is approached with 'nnn', but .*:2 plans 'ppp'"):
+        imported(other, "setup,posture,reading_mm,approach\nyx,zero,0.01,nnn\n")
+    table = "setup,posture,reading_mm,approach\nyx,zero,0.01,ppp\nyx,zero,0.02,nnn\n"
+    result = imported(other, table)  # the other side in addition to the planned one
+    assert (result.filled, result.unplanned) == (1, (3,))
+    assert "In addition to the rows of the session: row 3 of the table." in format_import(result)
 
 
 def test_an_import_changes_conditions_only_with_overwrite(tmp_path):

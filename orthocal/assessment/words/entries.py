@@ -177,12 +177,16 @@ def must_change(drives: Sequence[str]) -> Finding:
     return note("must change", _describe_change(drives, "more"), "", parameter_places(*drives))
 
 
-def not_significant(drives: Sequence[str]) -> Finding:
-    """Finding about offsets that change by less than their uncertainty."""
-    text = (
-        f"{_describe_change(drives, 'less')} Enter all offsets together: the tool error "
-        "depends on all of them."
-    )
+def not_significant(drives: Sequence[str], *, keep: bool) -> Finding:
+    """Finding about offsets that change by less than their uncertainty.
+
+    Args:
+        drives: The drives.
+        keep: Whether the active offsets are kept.
+    """
+    text = _describe_change(drives, "less")
+    if not keep:
+        text += " Enter all offsets together: the tool error depends on all of them."
     return note("not significant", text, "", parameter_places(*drives))
 
 

@@ -82,10 +82,15 @@ class TableImport:
     """Number of readings whose value or conditions change."""
     unchanged: int
     """Number of readings that the session already has."""
-    added: int
-    """Number of new rows."""
+    unplanned: tuple[int, ...]
+    """Rows of the table that the readings.csv does not have."""
     empty: int
     """Number of rows still without a reading."""
+
+    @property
+    def added(self) -> int:
+        """Number of new rows."""
+        return len(self.unplanned)
 
     @property
     def changes(self) -> bool:
@@ -127,7 +132,7 @@ def import_readings(
             (row, parse_row(row, plan, points))
             for row in _read_existing(readings_path, path, long_table, overwrite)
         ]
-    merged, counts = _merge(existing, new, overwrite)
+    merged, added, counts = _merge(existing, new, overwrite)
     readings, points = check_readings(merged, plan, file=readings_path)
     check_contacts(replace(plan, readings=readings, setups=points.setups, gauges=points.gauges))
     required = {
@@ -144,7 +149,7 @@ def import_readings(
         filled=counts["filled"],
         replaced=counts["replaced"],
         unchanged=counts["unchanged"],
-        added=counts["added"],
+        unplanned=tuple(row.line for row in added),
         empty=sum(not _is_filled(row) for row in merged),
     )
 
@@ -267,11 +272,11 @@ def _key(row: _Row) -> Key:
 
 def _merge(
     existing: Sequence[_Row], new: Sequence[_Row], overwrite: bool
-) -> tuple[list[RawReading], Counter[str]]:
+) -> tuple[list[RawReading], list[RawReading], Counter[str]]:
     """Merge new readings into the existing rows; further readings follow at the end.
 
     Returns:
-        Rows, and the numbers of filled, replaced, unchanged and added rows.
+        All rows, the added ones, and the numbers of filled, replaced and unchanged rows.
 
     Raises:
         SessionError: If a reading or a condition differs and must not be overwritten.
@@ -306,8 +311,29 @@ def _merge(
         )
     added = [row for rows_of_key in pending.values() for row, _ in rows_of_key]
     _require_approaches(added, [row for row, _ in existing])
-    counts["added"] = len(added)
-    return [*rows, *added], counts
+    _refuse_other_approaches(added, [row for row in rows if not _is_filled(row)])
+    return [*rows, *added], added, counts
+
+
+def _refuse_other_approaches(added: Sequence[RawReading], empty: Sequence[RawReading]) -> None:
+    """Refuse new rows in postures that the session plans to read from another side.
+
+    Raises:
+        SessionError: If there is such a row; names the first one and that of the session.
+    """
+    for row in added:
+        for planned in empty:
+            same = (row.setup, row.posture, row.minus, row.cycle or "1") == (
+                *(planned.setup, planned.posture, planned.minus),
+                planned.cycle or "1",
+            )
+            if same and {"p", "n"} in map(set, zip(row.approach, planned.approach, strict=False)):
+                raise SessionError(
+                    f"{row.setup} {row.posture} of cycle {row.cycle or 1} is approached with "
+                    f"'{row.approach}', but {planned.where} plans '{planned.approach}'; correct "
+                    "one of them, p where the drive coordinate grows and n where it falls",
+                    where=row.where,
+                )
 
 
 def _require_approaches(added: Sequence[RawReading], existing: Sequence[RawReading]) -> None:

@@ -123,7 +123,12 @@ def _describe_changes(result: TableImport) -> str:
     """Changes of the session's readings.csv."""
     parts = [f"{n} {words}" for name, words in CHANGES.items() if (n := getattr(result, name))]
     empty = f"; {counted(result.empty, 'row')} still without a reading" if result.empty else ""
-    return f"{result.readings_path}: {', '.join(parts)}{empty}"
+    planned = result.filled or result.replaced or result.unchanged or result.empty
+    rows = _format_rows(result.unplanned)
+    unplanned = f"\nIn addition to the rows of the session: {rows} of the table."
+    return f"{result.readings_path}: {', '.join(parts)}{empty}" + unplanned * bool(
+        planned and result.unplanned
+    )
 
 
 def format_import_json(result: TableImport, *, written: bool) -> str:
