@@ -421,6 +421,7 @@ def check_range(
     lowest, highest = range_mm
     if difference and gauge.range is not None:
         lowest, highest = lowest - highest, highest - lowest
+    limits = f"{lowest:g} to {highest:g}"
     lowest, highest = lowest - ROUNDING_MM, highest + ROUNDING_MM
     beyond_sensor = abs(value_mm) > largest_mm
     if not beyond_sensor and not (value_mm < lowest or value_mm > highest):
@@ -437,5 +438,5 @@ def check_range(
         )
     else:
         kind = "a difference" if difference else "a reading"
-        expected = f"the gauge's range allows {kind} from {lowest:g} to {highest:g}{hint}"
+        expected = f"the gauge's range allows {kind} from {limits}{hint}"
     raise SessionError(f"{name} is {value_mm:g}; {expected}", where=where)
