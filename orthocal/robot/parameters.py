@@ -538,7 +538,7 @@ def _match(pattern: str, names: Collection[str]) -> list[str]:
 def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
     """Refuse a key whose unit is not that of the parameter."""
     if unit != parameter.unit:
-        matched = ", which it matches, too," if set(key) & set("*?[") else ""
+        matched = ", which it matches," if set(key) & set("*?[") else ""
         raise ParameterError(
             f"'{key}' has the wrong unit; {parameter.name}{matched} is in {parameter.edge_unit}"
         )
