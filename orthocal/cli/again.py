@@ -22,7 +22,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
+from orthocal.cli.sheet import note_contradictions, sheet_or_problem
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.files import exists
 from orthocal.text import quote_path
@@ -92,7 +92,7 @@ def again(
     put_out(_describe_entries(new, result, calibration, ini=ini if entered else None))
     _note_other_lines(result, new, ini, joints)
     _note_numbers(new)
-    note_beyond_limits(new, ini)
+    note_contradictions(new, ini)
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, sheet.html and its programs")

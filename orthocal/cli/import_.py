@@ -12,7 +12,6 @@ from orthocal.cli.options import Json, command, read_pairs
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
-from orthocal.measurement.files.session_file import list_sessions
 from orthocal.text import printable, quote_path
 from orthocal.units import MM
 
@@ -134,6 +133,8 @@ def _require_session(table: Path, session: Path) -> None:
     Raises:
         SessionError: Naming what is missing, or the order of exchanged arguments.
     """
+    from orthocal.measurement.files.session_file import list_sessions
+
     if exists(_session_file(session)):
         return
     if not exists(table):

@@ -30,7 +30,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheet import following_command, note_beyond_limits
+from orthocal.cli.sheet import following_command, note_contradictions
 from orthocal.errors import (
     ClosureError,
     ParameterError,
@@ -221,7 +221,7 @@ def new(
     design = _design(name, dimensions, options, controller)
     _write(folder, name, design)
     _report(folder, design)
-    note_beyond_limits(design.session, controller.ini)
+    note_contradictions(design.session, controller.ini)
     put_note(design.assumed_tip)
     if not design.tolerance_stated:
         put_note(

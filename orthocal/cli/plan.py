@@ -39,7 +39,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import deliver, put_note
-from orthocal.cli.sheet import note_beyond_limits, sheet_or_problem
+from orthocal.cli.sheet import note_contradictions, sheet_or_problem
 from orthocal.errors import ParameterError
 from orthocal.text import quote_path
 from orthocal.units import MM
@@ -135,7 +135,7 @@ def plan(
         tolerances = chosen.session.robot.parameters.stated if stated else {}
         with worker_budget(workers):
             _write(chosen, out, calibrate_command(sessions, tolerances, folder=out))
-        note_beyond_limits(chosen.session, controller.ini)
+        note_contradictions(chosen.session, controller.ini)
         calibrating = calibrate_command(sessions, tolerances)
         put_note(f"Next:\n  orthocal record {quote_path(out)}\n  {calibrating}")
     elif not json:

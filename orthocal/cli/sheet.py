@@ -58,7 +58,7 @@ def sheet(
         noun = "program" if plan.firmware is None else "file"
         programs = f" and {counted(count, noun)}{' of lines to send' * (noun == 'file')}"
     put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
-    note_beyond_limits(plan, ini)
+    note_contradictions(plan, ini)
 
 
 def following_command(plan: orthocal.Session, path: Path, directory: Path) -> str:
@@ -97,18 +97,27 @@ def sheet_or_problem(
         return {}, f"orthocal: no measuring sheet: {e}"
 
 
-def note_beyond_limits(session: orthocal.Session, ini: Path | None) -> None:
-    """Note motions of a new session's programs beyond the soft limits of an INI file.
+def note_contradictions(session: orthocal.Session, ini: Path | None) -> None:
+    """Note motions beyond the soft limits of an INI file, and wrong directions of homing.
 
     Args:
         session: The plan.
         ini: The INI file of LinuxCNC; None without one.
     """
+    from orthocal.assessment.wording import joined
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+    from orthocal.measurement.motion.approach import usual_approaches
     from orthocal.output.sheet.soft_limits import describe_beyond_limits
 
     if ini is None:
         return
-    limits = read_controller_joints(ini, session.robot).limits
+    joints = read_controller_joints(ini, session.robot)
+    if joints.opposed and usual_approaches(session.robot):
+        verb = "has" if len(joints.opposed) == 1 else "have"
+        put_note(
+            f"{ini}: {joined(joints.opposed)} {verb} a HOME_LATCH_VEL whose sign is not that of "
+            "HOME_SEARCH_VEL: the switch may open before the backlash is taken up. Change the sign "
+            "of HOME_LATCH_VEL before the first reading, because this moves the zero"
+        )
     with suppress(SessionError):  # no measuring sheet, whose reason is printed
-        put_note(describe_beyond_limits(session, limits, file=str(ini)))
+        put_note(describe_beyond_limits(session, joints.limits, file=str(ini)))

@@ -170,7 +170,11 @@ def test_texts_carry_their_units(parameters):
         (read_known, "x_slide.offset_mm=1±", "expected a number"),
         (read_known, "x_slide.offset_mm=1±a", "expected a number"),
         (read_known, "x_slide.offset_mrad=1", "has the wrong unit"),
-        (read_tolerances, "*.offset_mrad=1", "has the wrong unit; x_slide.offset is in mm"),
+        (
+            read_tolerances,
+            "*.offset_mrad=1",
+            "x_slide.offset, which it matches, is in mm",
+        ),
         (read_tolerances, "w.offset_mm=1", "matches no error parameter"),
         (read_bounds, "x_slide.offset_mm=:", "expected NAME=LOWEST:HIGHEST"),
         (read_bounds, "x_slide.offset_mm=1", "expected NAME=LOWEST:HIGHEST"),

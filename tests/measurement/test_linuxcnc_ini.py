@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED
+from calibrated import UNJUDGED, plan_of
 from closed_form import inverse
 from commands import run_orthocal
 from conftest import marked_pictures
@@ -22,7 +23,9 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
+from orthocal.cli.sheet import note_contradictions
 from orthocal.effects.compensation import JointTrim, compensates_alike
+from orthocal.effects.loading import with_effects
 from orthocal.export.linuxcnc import entered_lines
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.units import DEG
@@ -84,6 +87,17 @@ def test_limits_that_limit_nothing_are_infinite(folder, orthoglide):
     unlimited = (-np.inf, np.inf)
     found = read_controller_joints(folder / "machine.ini", orthoglide).limits
     assert found == (unlimited, (5 * MM, np.inf), unlimited)
+
+
+@pytest.mark.parametrize(("effects", "noted"), [(["backlash"], True), ([], False)])
+def test_a_latch_against_the_search_is_noted(folder, orthoglide, capsys, effects, noted):
+    text = INI.replace("[JOINT_0]\n", "[JOINT_0]\nHOME_SEARCH_VEL = 9\n")
+    text = text.replace("[JOINT_1]\n", "[JOINT_1]\nHOME_SEARCH_VEL = 9\n")
+    (folder / "machine.ini").write_text(text)
+    assert read_controller_joints(folder / "machine.ini", orthoglide).opposed == ("[JOINT_0]",)
+    session = replace(plan_of("raw-cycles"), robot=with_effects(orthoglide, effects))
+    note_contradictions(session, folder / "machine.ini")
+    assert ("[JOINT_0] has a HOME_LATCH_VEL whose sign" in capsys.readouterr().err) == noted
 
 
 def test_lines_of_an_export_state_no_direction_of_latching(folder, orthoglide):

@@ -50,6 +50,8 @@ class ControllerJoints:
     """BACKLASH and COMP_FILE of each joint."""
     offsets: tuple[float, ...] | None = None
     """Offsets of the slides that the comment of exported lines states, [m, rad]; None otherwise."""
+    opposed: tuple[str, ...] = ()
+    """Sections of joints whose HOME_LATCH_VEL and HOME_SEARCH_VEL have opposite signs."""
 
 
 def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
@@ -66,7 +68,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     text = read_text(path, error=ParameterError)
     sections = _read_sections(text, path)
     trajectory = sections.get("TRAJ", {})
-    joints = []
+    joints, opposed = [], []
     for i, drive in enumerate(robot.drives):
         unit, where = drive.joint_unit, f"{path}: [JOINT_{i}]"
         _require_unit(trajectory, UNIT_KEYS[unit], unit, f"{path}: [TRAJ]")
@@ -77,6 +79,8 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
             )
         _require_unit(keys, "UNITS", unit, where)
         home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
+        if (latch or 0) * _read_number(keys, "HOME_SEARCH_VEL", where) < 0.0:
+            opposed.append(f"[JOINT_{i}]")
         joints.append((home, _read_limits(keys, drive, where), latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
@@ -87,7 +91,17 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         tuple(latch or 1 for latch in latched) if stated else None,
         trims,
         None if stated else _read_offsets(text, robot.drives),
+        tuple(opposed),
     )
+
+
+def _read_number(keys: Mapping[str, str], key: str, where: str) -> float:
+    """Number of a key; 0 if it is not stated.
+
+    Raises:
+        ParameterError: If it is no number.
+    """
+    return parse_number(keys.get(key, "0"), where=where, name=key, error=ParameterError)
 
 
 def _require_unit(keys: Mapping[str, str], key: str, unit: str, where: str) -> None:
@@ -133,7 +147,7 @@ def _read_joint(
         SessionError: If the COMP_FILE is wrong.
     """
     numbers = {
-        key: parse_number(keys.get(key, "0"), where=where, name=key, error=ParameterError)
+        key: _read_number(keys, key, where)
         for key in ("HOME_OFFSET", "HOME_LATCH_VEL", "BACKLASH", "COMP_FILE_TYPE")
     }
     unit, factor = drive.joint_unit, drive.joint_size
