@@ -10,11 +10,14 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place, Severity
-from orthocal.text import capitalised, uncapitalised
+from orthocal.text import capitalised, list_some, uncapitalised
 from orthocal.units import MM, UM, format_fixed
 
 MOST_ACTIONS = 3
 """Largest number of actions in the next step of a decision."""
+
+MOST_SETUPS = 6
+"""Largest number of setups that an action names."""
 
 ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""
@@ -93,12 +96,18 @@ def join_texts(texts: Sequence[str]) -> str:
 
 
 def _after_place(finding: Finding) -> str:
-    """Action of a finding after its first place, such as "Setup yx, line 4: read it again."."""
+    """Action of a finding after its place, such as "Setup yx, line 4: read it again.".
+
+    Of several places in one setup it is the first one.
+    """
     place, action = finding.places[0] if finding.places else Place(), finding.action
     if place.setup is None and place.parameter is None:
         return action
     line = "" if place.line is None else f", line {place.line}"
     label = place.parameter if place.setup is None else f"Setup {place.setup}{line}"
+    setups = list(dict.fromkeys(p.setup for p in finding.places if p.setup is not None))
+    if len(setups) > 1:
+        label = f"Setups {list_some(setups, MOST_SETUPS)}"
     return f"{label}: {uncapitalised(action)}"
 
 

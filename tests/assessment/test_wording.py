@@ -49,11 +49,11 @@ def test_findings_of_one_action_count_each():
 
 def test_names_keep_their_capitals():
     finding = review("fits", "text", "LinuxCNC must home.", (Place(setup="yx", line=3),))
-    other = review("fits", "text", "Read it again.", (Place(setup="yx"),))
+    other = review("fits", "text", "Read it again.", (Place(setup="yx"), Place(setup="zx")))
     lines = describe_actions([finding, other]).splitlines()
     assert lines[1:] == [
         "  1. Setup yx, line 3: LinuxCNC must home.",
-        "  2. Setup yx: read it again.",
+        "  2. Setups yx, zx: read it again.",
     ]
     texts = [uncapitalised(t) for t in ("URDF of it", "Of it", "A-b", "")]
     assert texts == ["URDF of it", "of it", "a-b", ""]
