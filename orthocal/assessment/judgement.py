@@ -146,7 +146,7 @@ def judge_session(session: Session) -> Judgement:
     mistakes, anomalies = _find_mistakes(session)
     implausible = find_implausible(session, explained=bool(mistakes))
     if any(f.kind == "wrong dimensions" for f in implausible):
-        implausible = _explain_dimensions(session, implausible)
+        implausible = _explain_dimensions(session, implausible, anomalies)
     scale, scale_findings = AS_STATED, []
     if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
@@ -261,8 +261,18 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
     return max(scales, key=lambda s: s.factor)
 
 
-def _explain_dimensions(session: Session, findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Findings with wrong dimensions replaced by a mounting that alone explains the readings."""
+def _explain_dimensions(
+    session: Session, findings: Sequence[Finding], anomalies: Sequence[Anomaly]
+) -> tuple[Finding, ...]:
+    """Findings without wrong dimensions if a mistake in all readings explains them.
+
+    Otherwise they are replaced by a mounting that alone explains the readings, if there is one.
+    """
+    for factor in (a.explanation.factor for a in anomalies if a.explanation.scope == "session"):
+        corrected = session.with_values(session.values * (factor or 1.0))
+        others = find_implausible(corrected, explained=True)
+        if not any(f.kind == "wrong dimensions" for f in others):
+            return tuple(f for f in findings if f.kind != "wrong dimensions")
     outstanding = _find_outstanding_error(session)
     if outstanding is None or outstanding[0].name in session.robot.parameters:
         return tuple(findings)

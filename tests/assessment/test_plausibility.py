@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -69,6 +70,23 @@ def test_readings_in_inches_are_found(session):
     assert "readings have more digits, or are in inches" in finer.text
     assert "residuals too small" in kinds(inches)
     assert [f.kind for f in judged(inches)] == ["wrong unit"]
+
+
+def test_readings_in_inches_do_not_accuse_the_dimensions(root, tmp_path):
+    """Beside the axes the nominal machine moves the gauge, which inches do not show."""
+    text = (root / "examples/raw-cycles/plan.yaml").read_text()
+    beside = re.sub(r"(_m\w+: {tcp_mm: )\[(.*?)\]", _beside, text)
+    (tmp_path / "plan.yaml").write_text(beside)
+    session = simulate_session(load_plan(tmp_path / "plan.yaml"), {}, seed=1).session
+    inches = session.with_values(np.round(session.values / 25.4, 7))
+    assert "wrong dimensions" in kinds(inches)
+    assert [f.kind for f in judged(inches)] == ["wrong unit"]
+
+
+def _beside(posture):
+    """Posture 6 mm beside the axis of its leg."""
+    shifted = ["6" if v.strip() == "0" else v for v in posture[2].split(",")]
+    return f"{posture[1]}[{', '.join(shifted)}]"
 
 
 def test_few_readings_between_the_steps_are_a_note_unless_all_of_a_setup():
