@@ -268,8 +268,9 @@ def _explain_dimensions(
 
     Otherwise they are replaced by a mounting that alone explains the readings, if there is one.
     """
-    for factor in (a.explanation.factor for a in anomalies if a.explanation.scope == "session"):
-        corrected = session.with_values(session.values * (factor or 1.0))
+    explanations = [a.explanation for a in anomalies if a.explanation.scope == "session"]
+    for factor in (e.factor for e in explanations if e.factor is not None):
+        corrected = session.with_values(session.values * factor)
         others = find_implausible(corrected, explained=True)
         if not any(f.kind == "wrong dimensions" for f in others):
             return tuple(f for f in findings if f.kind != "wrong dimensions")

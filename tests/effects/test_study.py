@@ -89,6 +89,7 @@ def test_ignored_backlash_costs_what_the_covariance_predicts(folder):
     tools = np.array([table.columns[c] for c in ("tool_um", "tool_all_effects_um")]) * 1e-6
     costs = [-np.subtract(*np.sqrt((np.delete(tools, i, 1) ** 2).mean(1))) for i in range(16)]
     jackknife = np.std(costs) * np.sqrt(15.0)
+    # two estimates of a standard error; they differ by the order of 1/16, the number of machines
     assert s.cost_standard_error == pytest.approx(jackknife, rel=0.1)
     document = report_study(table).document
     assert document["ignored"] == ["backlash"]
