@@ -68,19 +68,22 @@ def test_killed_and_resumed_several_times(study, undisturbed, tmp_path):
     began = time.monotonic()
     run_task(study, 1)
     a_task = time.monotonic() - began
-    kept, kills = set(), 0
-    while kills < KILLS or not kept:  # where the machine is busy more is needed for a first one
-        kills += 1
-        assert kills < 10 * KILLS
+    kept, journal = set(), tmp_path / JOURNAL
+    for _ in range(KILLS):
         child = FORK.Process(target=run_study, args=(study,), kwargs={"directory": tmp_path})
         child.start()
-        time.sleep(float(rng.uniform(0.0, (2.0 + 0.1 * kills) * a_task)))
+        written = 1 + len(kept)  # lines: the first one describes the study
+        while child.is_alive() and not (
+            journal.exists() and journal.read_bytes().count(b"\n") > written
+        ):
+            time.sleep(0.1 * a_task)
+        time.sleep(float(rng.uniform(0.0, a_task)))
         os.kill(child.pid, signal.SIGKILL)
         child.join()
-        if (tmp_path / JOURNAL).exists():
-            with open_results(tmp_path / JOURNAL, study) as (stored, _):
-                assert kept <= set(stored)
-                kept = set(stored)
+        with open_results(journal, study) as (stored, _):
+            assert kept <= set(stored)
+            kept = set(stored)
+        assert kept
     again = run_study(study, directory=tmp_path)
     assert results(again) == results(undisturbed)
 
