@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
@@ -231,13 +231,7 @@ def measure_first(values: Array, other: Array) -> Timing:
         other: Those of another machine.
     """
     session = exact(sweep()).with_values(values)
-    run = identify(session, session.with_values(other))
-    seconds = [run.timing.seconds_again]
-    for _ in range(4):  # the fastest is what a busy machine disturbed least
-        began = time.process_time()
-        run.program.solve(sigma=SIGMA, values=run.program.problem.observations.values(other))
-        seconds.append(time.process_time() - began)
-    return replace(run.timing, seconds_again=min(seconds))
+    return identify(session, session.with_values(other)).timing
 
 
 def measure_first_apart(values: Array, other: Array) -> Timing:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from types import SimpleNamespace
 
 import numpy as np
+from ratios import ratio_of, seconds_of
 
 from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.interpreter import Interpreter
@@ -41,12 +41,10 @@ def test_programs_are_corrected_faster_than_the_machine_is_asked(
             patch.setattr(llvm, "is_installed", lambda: False)
             field.exactly(points[:1000] * 1e-3)
 
-    rates = []
-    for do, count in ((correct, LINES), (ask, 1000)):
-        do()  # what is made once: polynomials, and functions that are compiled
-        began = time.process_time()
-        do()
-        rates.append(count / (time.process_time() - began))
-    record_property("points a second", round(rates[0]))
-    record_property("of the machine itself", round(rates[1]))
-    assert rates[0] > CORRECTED * rates[1]
+    correct()  # polynomials, and functions that are compiled
+    ask()
+    ratio = ratio_of(
+        lambda: seconds_of(ask) / 1000, lambda: seconds_of(correct) / LINES, above=CORRECTED
+    )
+    record_property("points a second over those of the machine", ratio)
+    assert ratio > CORRECTED
