@@ -28,7 +28,7 @@ from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
 
-SCHEMA = "orthocal/calibration/17"
+SCHEMA = "orthocal/calibration/18"
 
 DERIVED_TOLERANCE = 1e-9
 """Largest relative difference of a derived number from its recomputed value."""

@@ -62,9 +62,7 @@ def again(
             BACKLASH and COMP_FILE the session then states; default: the backlash to enter, and the
             tables of the last session. Motions beyond its soft limits are named.
     """
-    from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import note_wrong_order, require_entering, require_offsets
-    from orthocal.export.linuxcnc.entered_lines import states_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     require_new_session(out, FILES, force=force)
@@ -73,29 +71,53 @@ def again(
     if not anyway:
         require_entering(result)
     amounts = _read_amounts(result, adjusted, anyway=anyway)
-    new = _plan_again(result, session, amounts)
-    joints = None
-    if ini is None:
-        new = replace(
-            new, compensation=compensation_to_enter(result) or result.session.compensation
-        )
-    else:
-        joints = read_controller_joints(ini, result.robot)
-        new = replace(new, compensation=joints.compensation)
-    new = replace(new, offsets_from=calibration)
+    new = replace(_plan_again(result, session, amounts), offsets_from=calibration)
+    joints = None if ini is None else read_controller_joints(ini, result.robot)
+    adjusted_result = orthocal.adjust_calibration(result, amounts)
+    new, entered = _state_joints(new, result, adjusted_result, joints)
     _write(new, out, f"orthocal validate {quote_path(os.path.relpath(calibration, out))} .")
     put_note(note_wrong_order(result))
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
-    entered = joints is not None and states_offsets(joints.offsets, new.active_offsets)
     put_out(_describe_entries(new, result, calibration, ini=ini if entered else None))
-    _note_other_lines(result, new, ini, joints)
+    _note_other_lines(adjusted_result, new, ini, joints)
     _note_numbers(new)
     note_contradictions(new, ini)
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, sheet.html and its programs")
+
+
+def _state_joints(
+    new: orthocal.Session,
+    calibration: orthocal.Calibration,
+    adjusted: orthocal.Calibration,
+    joints: ControllerJoints | None,
+) -> tuple[orthocal.Session, bool]:
+    """Session that states the joints of the controller, and whether they have its offsets.
+
+    It states their home positions only in this case.
+
+    Args:
+        new: The session.
+        calibration: The calibration that it repeats.
+        adjusted: The same with the adjustments since then.
+        joints: Joints of an INI file; None without the file.
+    """
+    from orthocal.assessment.controller_entries import compensation_to_enter
+    from orthocal.effects.compensation import with_homes
+    from orthocal.export.linuxcnc.entered_lines import states_homes, states_offsets
+
+    if joints is None:
+        trims, entered = compensation_to_enter(calibration), False
+        trims = trims or calibration.session.compensation
+    else:
+        trims = joints.compensation
+        entered = states_homes(adjusted, trims, joints.latched) or states_offsets(
+            joints.offsets, new.active_offsets
+        )
+    return replace(new, compensation=trims if entered else with_homes(trims, None)), entered
 
 
 def _write(new: orthocal.Session, out: Path, validating: str) -> None:
@@ -136,7 +158,7 @@ def _note_other_lines(
     """Note tables of an export that a session does not state, or other lines of an INI file.
 
     Args:
-        calibration: The calibration.
+        calibration: The calibration, with the adjustments since then.
         new: The new session.
         ini: INI file of the option `--ini`.
         joints: Its joints; None without the file.
@@ -157,6 +179,7 @@ def _note_other_lines(
             calibration,
             joints.compensation,
             joints.offsets,
+            latched=joints.latched,
             entered=new.active_offsets,
             file=str(ini),
         )

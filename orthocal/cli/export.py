@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,7 +29,9 @@ from orthocal.text import printable
 from orthocal.units import MM, UM
 
 if TYPE_CHECKING:
+    from orthocal.effects.compensation import JointTrim
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
+    from orthocal.robot.model import Drive
 
 ALTERNATIVES = ("joints.ini", "kinematics.ini")
 """Files that exclude each other: new HOME_OFFSET, and a module that contains the offsets."""
@@ -66,7 +68,8 @@ def export(
         module: linuxcnc: write a module, or HOME_OFFSET only; default: by what was identified.
         within (UM): linuxcnc: largest error of the module itself at the tool, µm; default: 0.1.
         home_offset (VALUES): linuxcnc: HOME_OFFSET of each joint during the measurement, separated
-            by commas, mm or degrees; without it the files contain changes only.
+            by commas, mm or degrees; default: as the session states. If neither states it, the
+            files contain changes only.
         latched (SIGNS): linuxcnc: sign of HOME_LATCH_VEL of each joint, such as +,+,-; it matters
             for drives with backlash. Default: + for all joints.
         ini (FILE): linuxcnc: INI file during the measurement: HOME_OFFSET, latching, soft limits.
@@ -77,8 +80,7 @@ def export(
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
-        home_offsets=(joints.home_offsets if joints else None)
-        or _home_offsets(home_offset, result),
+        home_offsets=_home_offsets(home_offset, joints, result),
         latched=(joints.latched if joints else None) or _signs(latched),
         joint_limits=joints.limits if joints else None,
         half_side=None if half_side_mm is None else half_side_mm * MM,
@@ -175,7 +177,7 @@ def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
 def _read_joints(
     path: Path, calibration: orthocal.Calibration, to: str, stated: Mapping[str, str | None]
 ) -> ControllerJoints:
-    """Read the joints of an INI file; refuse a compensation that differs from the session's.
+    """Read the joints of an INI file; refuse other joints than the session states.
 
     Args:
         path: The INI file.
@@ -184,8 +186,8 @@ def _read_joints(
         stated: Values of the options that the file replaces, by option.
 
     Raises:
-        ParameterError: If the format is another one, the compensation differs, or such an option is
-            stated.
+        ParameterError: If the format is another one, HOME_OFFSET or the compensation differs, or
+            such an option is stated.
     """
     from orthocal.effects.compensation import JointTrim
     from orthocal.export.linuxcnc.entered_lines import compare_joints
@@ -200,22 +202,61 @@ def _read_joints(
             raise ParameterError("is stated by --ini, too; state one of them", where=option)
     drives, stated_trims = calibration.robot.drives, calibration.session.compensation
     expected = stated_trims or (JointTrim(),) * len(drives)
-    if differences := compare_joints(zip(drives, expected, joints.compensation, strict=True)):
+    pairs = list(zip(drives, expected, joints.compensation, strict=True))
+    if differences := compare_joints(pairs):
         raise ParameterError(
             "has other BACKLASH or COMP_FILE than the session states under `controller` "
             f"(backlash, comp_file): {differences}. Expected is the INI file of the measurement",
             where=str(path),
         )
+    _require_same_homes(pairs, where=str(path))
     return joints
 
 
-def _home_offsets(text: str | None, calibration: orthocal.Calibration) -> tuple[float, ...] | None:
-    """HOME_OFFSET of each joint, [m, rad]; None if the option is absent."""
+def _require_same_homes(
+    joints: Iterable[tuple[Drive, JointTrim, JointTrim]], *, where: str
+) -> None:
+    """Refuse other positions of HOME_OFFSET than those of the measurement: it would change twice.
+
+    Args:
+        joints: Drive, and HOME_OFFSET of its joint in the session and now.
+        where: File or option, for messages.
+
+    Raises:
+        ParameterError: If they differ.
+    """
+    from orthocal.export.linuxcnc.entered_lines import compare_homes
+
+    if differences := compare_homes(joints):
+        raise ParameterError(
+            "has other HOME_OFFSET than the session states under `controller` (home_offset): "
+            f"{differences}. Expected is HOME_OFFSET during the measurement, before the offsets of "
+            "this calibration were entered. If the session states it wrongly, correct it there "
+            "and calibrate again",
+            where=where,
+        )
+
+
+def _home_offsets(
+    text: str | None, joints: ControllerJoints | None, calibration: orthocal.Calibration
+) -> tuple[float, ...] | None:
+    """HOME_OFFSET of each joint by the INI file or the option, [m, rad]; None without both.
+
+    Raises:
+        ParameterError: If the option is malformed, or differs from what the session states.
+    """
+    from orthocal.effects.compensation import JointTrim
+
+    if joints is not None and joints.home_offsets is not None:
+        return joints.home_offsets
     if text is None:
         return None
-    drives = calibration.robot.drives
+    drives, trims = calibration.robot.drives, calibration.session.compensation
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
-    return tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
+    homes = tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
+    stated = (JointTrim(home=home) for home in homes)
+    _require_same_homes(zip(drives, trims, stated, strict=False), where="--home-offset")
+    return homes
 
 
 def _signs(text: str | None) -> tuple[int, ...] | None:

@@ -9,7 +9,7 @@ backlash.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -24,7 +24,7 @@ from orthocal.robot.model import Drive, Robot
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTrim:
-    """Trim that a controller adds to the position of one joint."""
+    """Trim that a controller adds to the position of one joint, and the joint's home position."""
 
     __pydantic_config__ = CLOSED
 
@@ -33,6 +33,8 @@ class JointTrim:
     table: Matrix | None = None
     """Position of the joint, trim after the position grew, trim after it fell; shape (n, 3),
     [m, rad]."""
+    home: Number | None = None
+    """Position of the joint at its home switch (HOME_OFFSET), [m, rad]; None if not stated."""
 
     def __call__(self, joints: Array) -> Array:
         """Trims T₊ and T₋ in positions of the joint.
@@ -76,6 +78,18 @@ def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> b
         if np.abs(a(joints) - b(joints)).max() > SAME_TRIM:
             return False
     return True
+
+
+def with_homes(trims: Sequence[JointTrim], homes: Sequence[float | None] | None) -> Compensation:
+    """Trims with other home positions, [m, rad]; without any if `homes` is None."""
+    stated = [None] * len(trims) if homes is None else homes
+    return tuple(replace(trim, home=home) for trim, home in zip(trims, stated, strict=True))
+
+
+def home_positions(trims: Sequence[JointTrim]) -> tuple[float, ...] | None:
+    """Home positions of all joints, [m, rad]; None unless all are stated."""
+    homes = tuple(trim.home for trim in trims if trim.home is not None)
+    return homes if homes and len(homes) == len(trims) else None
 
 
 def displace_drives(

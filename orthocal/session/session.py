@@ -282,7 +282,8 @@ class Session:
     controller_offsets: Array | None = None
     """Active offsets, shape (n_drives,), [m, rad]; None if not stated."""
     compensation: Compensation = ()
-    """Compensation of backlash and errors of screws by the controller; empty if not stated."""
+    """Compensation of backlash and errors of screws by the controller, and home positions of its
+    joints; empty if not stated."""
     controller_origin: Triple = (0.0, 0.0, 0.0)
     """Machine coordinates (G53) of the world's origin, [m]."""
     offsets_from: Path | None = None

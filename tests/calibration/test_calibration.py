@@ -52,7 +52,7 @@ def test_a_loaded_calibration_is_the_written_one(tmp_path):
 
 def test_the_file_has_the_documented_keys(result):
     document = json.loads(calibration_json(result))
-    assert document["schema"] == "orthocal/calibration/17"
+    assert document["schema"] == "orthocal/calibration/18"
     assert {
         "robot",
         "session",

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from calibrated import UNJUDGED, plan_of
 from closed_form import inverse
 from commands import run_orthocal
@@ -22,9 +23,15 @@ from orthocal import (
     load_plan,
     simulate_session,
     write_calibration,
+    write_session,
 )
 from orthocal.cli.sheet import note_contradictions
-from orthocal.effects.compensation import JointTrim, compensates_alike
+from orthocal.effects.compensation import (
+    JointTrim,
+    compensates_alike,
+    home_positions,
+    with_homes,
+)
 from orthocal.effects.loading import with_effects
 from orthocal.export.linuxcnc import entered_lines
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
@@ -55,6 +62,10 @@ BACKLASH = 0.2
 """
 
 
+HOMES = (352.5, 340.0, -3.25)
+"""HOME_OFFSET of its joints, [mm]."""
+
+
 @pytest.fixture(scope="module", autouse=True)
 def without_pictures():
     with marked_pictures():
@@ -70,7 +81,8 @@ def folder(tmp_path):
 
 def test_joints_are_read(folder, orthoglide):
     joints = read_controller_joints(folder / "machine.ini", orthoglide)
-    assert np.array(joints.home_offsets) / MM == pytest.approx([352.5, 340.0, -3.25])
+    assert np.array(joints.home_offsets) / MM == pytest.approx(HOMES)
+    assert home_positions(joints.compensation) == joints.home_offsets
     assert joints.latched == (-1, 1, 1)
     at = np.array([0.05])
     shown = [trim(at)[0] / MM for trim in joints.compensation]
@@ -186,6 +198,27 @@ def plain(folder):
     lines = [v for v in INI.splitlines() if not v.startswith(("BACKLASH", "COMP"))]
     (folder / "plain.ini").write_text("\n".join(lines))
     return folder / "plain.ini"
+
+
+@pytest.fixture(scope="module")
+def at_home(one, tmp_path_factory):
+    """Directory of the same calibration, whose session states HOME_OFFSET."""
+    result, folder = load_calibration(one), tmp_path_factory.mktemp("at-home")
+    trims = with_homes((JointTrim(),) * 3, np.array(HOMES) * MM)
+    session = replace(result.session, compensation=trims)
+    write_calibration(replace(result, session=session), folder / "calibration.json")
+    return folder
+
+
+def with_lines(text, exported):
+    """Lines of a controller after HOME_OFFSET and BACKLASH of an export were entered."""
+    for i in range(3):
+        section = exported.partition(f"[JOINT_{i}]")[2].partition("[")[0]
+        lines = re.findall(r"(?m)^(?:HOME_OFFSET|BACKLASH) = .*$", section)
+        before, mark, after = text.partition(f"[JOINT_{i}]\n")
+        after = re.sub(r"HOME_OFFSET = .*", "\n".join(lines), after, count=1)
+        text = before + mark + after
+    return text
 
 
 def export(folder, one, out, *words):
@@ -368,6 +401,66 @@ def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     export = f"`orthocal export {one} --to linuxcnc --offsets --ini FILE --out DIRECTORY`"
     assert f"Do not type them as HOME_OFFSET: {export} writes" in done.stdout
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
+
+
+def test_home_offsets_are_written_and_read(folder, orthoglide):
+    plan = load_plan(write_plan(folder / "plan", effects="backlash: {}"))
+    trims = read_controller_joints(folder / "machine.ini", orthoglide).compensation
+    write_session(replace(plan, compensation=trims), folder / "written")
+    controller = yaml.safe_load((folder / "written/session.yaml").read_text())["controller"]
+    assert controller["home_offset_mm"] == list(HOMES)
+    read = load_plan(folder / "written").compensation
+    assert np.array(home_positions(read)) / MM == pytest.approx(HOMES)
+    assert compensates_alike(read, trims)
+
+
+def test_export_begins_with_the_home_offsets_of_the_session(folder, at_home, plain):
+    for name, words in (("session", ["--latched=-,+,+"]), ("file", ["--ini", plain])):
+        assert export(folder, at_home, name, *words).returncode == 0
+    texts = [(folder / name / "joints.ini").read_text() for name in ("session", "file")]
+    entered = [re.findall(r"(?m)^HOME_OFFSET = .*", text) for text in texts]
+    assert entered[0] == entered[1]
+    assert len(entered[0]) == 3
+
+
+def test_offsets_are_not_entered_twice(folder, at_home, plain):
+    assert export(folder, at_home, "home", "--ini", plain).returncode == 0
+    lines = (folder / "home/joints.ini").read_text()
+    new = re.search(r"(?m)^HOME_OFFSET = (\S+)", lines)[1]
+    entered = re.sub("BACKLASH = .*", "", with_lines(plain.read_text(), lines))
+    (folder / "entered.ini").write_text(entered)
+    for name, words in (
+        ("entered.ini", ["--ini", "entered.ini"]),
+        ("--home-offset", ["--home-offset", f"{new},340,-3.25"]),
+    ):
+        done = export(folder, at_home, "twice", *words)
+        message = " ".join(done.stderr.split())
+        assert done.returncode == 2
+        assert f"{name}: has other HOME_OFFSET" in message
+        expected = rf"JOINT_0 has HOME_OFFSET {float(new):.3f} mm instead of 352.500 mm"
+        assert expected in message
+        assert not (folder / "twice").exists()
+
+
+def test_again_compares_home_offsets(folder, at_home, plain):
+    """With those that the calibration says to enter."""
+    assert export(folder, at_home, "home", "--ini", plain).returncode == 0
+    lines = (folder / "home/joints.ini").read_text()
+    (folder / "entered.ini").write_text(with_lines(plain.read_text(), lines))
+    found = [float(v) for v in re.findall(r"(?m)^HOME_OFFSET = (\S+)", lines)]
+    for k, ini in enumerate(("entered.ini", "home/joints.ini")):  # the latter states no latching
+        done = run_orthocal(folder, "again", at_home, "--out", f"second-{k}", "--ini", ini)
+        assert done.returncode == 0
+        assert f"The lines of {ini} contain them" in " ".join(done.stdout.split())
+        assert "instead of" not in done.stderr
+        stated = home_positions(load_plan(folder / f"second-{k}").compensation)
+        assert np.array(stated) / MM == pytest.approx(found)
+    done = run_orthocal(folder, "again", at_home, "--out", "third", "--ini", plain)
+    text = " ".join(done.stderr.split())
+    assert done.returncode == 0
+    assert "does not have the offsets that the new session states: JOINT_0 has" in text
+    assert f"HOME_OFFSET 352.500 mm instead of {found[0]:.3f} mm" in text
+    assert home_positions(load_plan(folder / "third").compensation) is None
 
 
 def test_small_differences_are_shown_with_all_their_decimals(fivebar, monkeypatch):

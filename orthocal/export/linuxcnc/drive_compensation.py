@@ -158,7 +158,7 @@ def find_active_compensation(
         )
     trims = calibration.session.compensation or (JointTrim(),) * len(signs)
     return tuple(
-        JointCompensation(trim.backlash, trim.table, sign)
+        JointCompensation(trim.backlash, trim.table, trim.home, latched=sign)
         for trim, sign in zip(trims, signs, strict=True)
     )
 
@@ -190,7 +190,7 @@ def find_compensation(
         enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, active, strict=True)
     ]
     return tuple(
-        JointCompensation(b if b >= NEGLIGIBLE else 0.0, None, joint.latched)
+        JointCompensation(b if b >= NEGLIGIBLE else 0.0, latched=joint.latched)
         for b, joint in zip(backlash, active, strict=True)
     )
 

@@ -9,9 +9,19 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.wording import joined
 from orthocal.calibration.calibration import Calibration
-from orthocal.effects.compensation import Compensation, JointTrim, compensates_alike
+from orthocal.effects.compensation import (
+    Compensation,
+    JointTrim,
+    compensates_alike,
+    home_positions,
+    with_homes,
+)
 from orthocal.errors import ExportError
-from orthocal.export.linuxcnc.drive_compensation import compensate_with_offsets
+from orthocal.export.linuxcnc.drive_compensation import (
+    compensate_with_offsets,
+    find_active_compensation,
+)
+from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.robot.model import Drive
 
 SAME_OFFSET = 0.6e-6
@@ -47,17 +57,17 @@ def describe_other_lines(
     compensation: Compensation,
     offsets: Sequence[float] | None,
     *,
+    latched: Sequence[int] | None = None,
     entered: Array,
     file: str,
 ) -> str:
     """Differences between the lines of a controller and those that an export would write.
 
-    HOME_OFFSET itself cannot be compared: a session does not state the old one.
-
     Args:
-        calibration: The calibration.
-        compensation: BACKLASH and COMP_FILE of the controller.
+        calibration: The calibration, with the adjustments since then.
+        compensation: BACKLASH, COMP_FILE and HOME_OFFSET of the controller.
         offsets: Offsets that a comment of exported lines states, [m, rad]; None without it.
+        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
         entered: Offsets that the new session states, shape (n_drives,), [m, rad].
         file: Name of the file with the lines.
 
@@ -77,7 +87,13 @@ def describe_other_lines(
             f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
             f"{values}. Enter the lines of this calibration's export."
         )
-    if differences := compare_joints(_pair_trims(calibration, compensation)):
+    pairs = _pair_trims(calibration, compensation, latched)
+    if not sentences and (differences := compare_homes(pairs)):
+        sentences.append(
+            f"{file} does not have the offsets that the new session states: {differences}. Enter "
+            "the lines of this calibration's export, and run `orthocal again` once more."
+        )
+    if differences := compare_joints(pairs):
         sentences.append(
             f"{file} differs from the lines that this calibration says to enter: "
             f"{differences}. The new session states what the file contains: measure with "
@@ -102,17 +118,63 @@ def compare_joints(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
     )
 
 
+def compare_homes(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
+    """Differences between the expected and the present HOME_OFFSET of joints; "" without any.
+
+    Args:
+        joints: Drive, expected and present HOME_OFFSET of each joint; those that are not stated do
+            not differ.
+    """
+    return joined(
+        [
+            f"JOINT_{i} has HOME_OFFSET {_show(drive, trim.home, joint.home)} instead of "
+            f"{_show(drive, joint.home, trim.home)}"
+            for i, (drive, joint, trim) in enumerate(joints)
+            if joint.home is not None
+            and trim.home is not None
+            and abs(joint.home - trim.home) > SAME_OFFSET
+        ]
+    )
+
+
+def states_homes(
+    calibration: Calibration, stated: Compensation, latched: Sequence[int] | None
+) -> bool:
+    """True if a controller has the HOME_OFFSET that an export writes.
+
+    Args:
+        calibration: The calibration, with the adjustments since then.
+        stated: Joints of the controller.
+        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+    """
+    pairs = _pair_trims(calibration, stated, latched)
+    known = all(None not in (joint.home, trim.home) for _, joint, trim in pairs)
+    return bool(pairs) and known and not compare_homes(pairs)
+
+
 def _pair_trims(
-    calibration: Calibration, stated: Compensation
+    calibration: Calibration, stated: Compensation, latched: Sequence[int] | None = None
 ) -> list[tuple[Drive, JointTrim, JointTrim]]:
-    """Drives with the trim that an export writes and a stated trim; empty if it writes none."""
+    """Drives with the joint that an export writes and a stated one; empty if it writes none.
+
+    If the direction of latching is unknown, HOME_OFFSET is the nearer one of both directions.
+    """
     drives = calibration.robot.drives
+    trims = stated or (JointTrim(),) * len(drives)
     try:
-        expected = compensate_with_offsets(calibration)
+        expected = compensate_with_offsets(calibration, latched)
     except ExportError:
         return []
-    trims = stated or (JointTrim(),) * len(drives)
-    return list(zip(drives, expected, trims, strict=True))
+    before = find_active_compensation(calibration, latched)
+    homes = None
+    if (old := home_positions(before)) is not None:
+        homes = [
+            joint.new if latched else joint.nearest(trim.home)
+            for joint, trim in zip(
+                find_homes(calibration, expected, before, old), trims, strict=True
+            )
+        ]
+    return list(zip(drives, with_homes(expected, homes), trims, strict=True))
 
 
 def _describe(drive: Drive, trim: JointTrim, other: JointTrim) -> str:

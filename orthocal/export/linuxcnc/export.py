@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries, find_screws
 from orthocal.calibration.calibration import Calibration
-from orthocal.effects.compensation import compensates_alike, format_table
+from orthocal.effects.compensation import compensates_alike, format_table, home_positions
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
@@ -123,6 +123,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         ParameterError: If an option of a module is stated for HOME_OFFSET, or values are missing.
     """
     before = find_active_compensation(calibration, options.latched)
+    options = replace(options, home_offsets=options.home_offsets or home_positions(before))
     stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
     if not module:

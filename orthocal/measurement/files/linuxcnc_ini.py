@@ -11,7 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.effects.compensation import MAX_COMP_FILE_ENTRIES, Compensation, JointTrim
+from orthocal.effects.compensation import (
+    MAX_COMP_FILE_ENTRIES,
+    Compensation,
+    JointTrim,
+    with_homes,
+)
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import LARGEST_NUMBER, parse_number, read_text
 from orthocal.io.fields import read_only
@@ -47,7 +52,7 @@ class ControllerJoints:
     latched: tuple[int, ...] | None
     """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
     compensation: Compensation
-    """BACKLASH and COMP_FILE of each joint."""
+    """BACKLASH, COMP_FILE and HOME_OFFSET of each joint."""
     offsets: tuple[float, ...] | None = None
     """Offsets of the slides that the comment of exported lines states, [m, rad]; None otherwise."""
     opposed: tuple[str, ...] = ()
@@ -85,11 +90,12 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
     known = stated or any(home is not None for home in homes)
+    home_offsets = tuple(home or 0.0 for home in homes) if known else None
     return ControllerJoints(
-        tuple(home or 0.0 for home in homes) if known else None,
+        home_offsets,
         limits,
         tuple(latch or 1 for latch in latched) if stated else None,
-        trims,
+        with_homes(trims, home_offsets),
         None if stated else _read_offsets(text, robot.drives),
         tuple(opposed),
     )

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.effects.compensation import Compensation, JointTrim
+from orthocal.effects.compensation import Compensation, JointTrim, with_homes
 from orthocal.errors import SessionError
 from orthocal.io.fields import read_only
 from orthocal.measurement.files.linuxcnc_ini import read_comp_file
 from orthocal.measurement.files.session_keys import (
     BACKLASH_KEYS,
+    HOME_KEYS,
     OFFSET_KEYS,
     ControllerKeys,
     keys_for_unit,
@@ -73,7 +74,9 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
 def build_compensation(
     keys: ControllerKeys | None, robot: Robot, *, folder: Path, where: str
 ) -> Compensation:
-    """Backlash and errors of screws that the controller compensates; empty if not stated.
+    """What the controller compensates, and home positions of its joints; empty if not stated.
+
+    If home positions alone are stated, nothing is compensated.
 
     Args:
         keys: Keys under `controller`; None if absent.
@@ -87,7 +90,8 @@ def build_compensation(
     if keys is None:
         return ()
     backlash = _read_drive_values(keys, BACKLASH_KEYS, "backlash", robot, where)
-    if backlash is None and keys.comp_file is None:
+    homes = _read_drive_values(keys, HOME_KEYS, "home offset", robot, where)
+    if backlash is None and homes is None and keys.comp_file is None:
         return ()
     names = keys.comp_file or [None] * len(robot.drives)
     table_key = f"{where}.comp_file"
@@ -98,7 +102,8 @@ def build_compensation(
         None if name is None else read_comp_file(folder, name, drive, table_key)
         for name, drive in zip(names, robot.drives, strict=True)
     )
-    return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))
+    trims = [JointTrim(float(v), table) for v, table in zip(values, tables, strict=True)]
+    return with_homes(trims, None if homes is None else homes.tolist())
 
 
 def build_firmware(keys: ControllerKeys | None, robot: Robot, where: str) -> DeltaSettings | None:

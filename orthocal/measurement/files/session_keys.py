@@ -80,9 +80,15 @@ BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
 }
 """Backlash keys of `controller`: SI unit of their drives and factor to SI."""
 
+HOME_KEYS: dict[str, tuple[Unit, float]] = {
+    "home_offset_mm": ("m", MM),
+    "home_offset_deg": ("rad", DEG),
+}
+"""The same of home positions."""
+
 
 def keys_for_unit(keys: Mapping[str, tuple[Unit, float]], unit: Unit) -> list[str]:
-    """Keys of OFFSET_KEYS or BACKLASH_KEYS for drives with a unit; a session states one of them."""
+    """Keys of one quantity for drives with a unit; a session states one of them."""
     return [key for key, (of_drives, _) in keys.items() if of_drives == unit]
 
 
@@ -179,6 +185,10 @@ class ControllerKeys(Keys):
     """Compensated backlash of prismatic drives."""
     backlash_deg: BacklashValues | None = None
     """Compensated backlash of revolute drives."""
+    home_offset_mm: Coordinates | None = None
+    """Position of the joints of prismatic drives at their home switches (HOME_OFFSET)."""
+    home_offset_deg: Coordinates | None = None
+    """The same of revolute drives."""
     comp_file: Annotated[list[str | None], Field(min_length=1, max_length=MAX_DRIVES)] | None = None
     """Table of trims for each drive (COMP_FILE of LinuxCNC, type 1); null for none."""
     firmware: FirmwareKeys | None = None

@@ -179,6 +179,10 @@ def _controller_document(session: Session) -> dict[str, Any]:
         for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
             backlash = tidy(joint.backlash / drive.joint_size)
             document.setdefault(f"backlash_{drive.joint_unit}", []).append(backlash)
+    for drive, joint in zip(session.robot.drives, session.compensation, strict=False):
+        if joint.home is not None:
+            home = tidy(joint.home / drive.joint_size)
+            document.setdefault(f"home_offset_{drive.joint_unit}", []).append(home)
     if any(joint.table is not None for joint in session.compensation):
         document["comp_file"] = [
             None if joint.table is None else table_name(i)

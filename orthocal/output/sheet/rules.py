@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC
-from orthocal.effects.compensation import describe_trims
+from orthocal.effects.compensation import describe_trims, home_positions
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length, describe_approach
 from orthocal.measurement.motion.stops import SetupMotion
@@ -76,6 +76,7 @@ def checks_of_machine(session: Session) -> list[str]:
         f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
+        *([text] if (text := _homes(session)) else []),
         "Check each rod and each hinge for play that the dial shows, and remove it: the "
         "calibration cannot correct it.",
     ]
@@ -140,6 +141,19 @@ def _compensation(session: Session) -> str:
         "BACKLASH, COMP_FILE). Write it into session.yaml, 0 for none, in the order "
         f"{', '.join(d.name for d in session.robot.drives)}: controller: "
         f"{{{drive_keys('backlash', session.robot.drives)}}}."
+    )
+
+
+def _homes(session: Session) -> str:
+    """HOME_OFFSET that the session states; empty if it does not."""
+    homes = home_positions(session.compensation)
+    if homes is None:
+        return ""
+    drives = session.robot.drives
+    stated = ", ".join(f"{d.name} {d.show(h)}" for d, h in zip(drives, homes, strict=True))
+    return (
+        f"Check that HOME_OFFSET is as session.yaml states: {stated}. If you have changed it, "
+        "write the present numbers there (home_offset under `controller`)."
     )
 
 
