@@ -14,15 +14,15 @@ from orthocal.effects.compensation import (
     JointTrim,
     compensates_alike,
     home_positions,
-    with_homes,
 )
 from orthocal.errors import ExportError
 from orthocal.export.linuxcnc.drive_compensation import (
     compensate_with_offsets,
     find_active_compensation,
+    with_latching,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
-from orthocal.robot.model import Drive
+from orthocal.robot.model import Drive, Robot
 
 SAME_OFFSET = 0.6e-6
 """Largest difference between equal offsets, [m, rad]: they are printed to 1 µm."""
@@ -87,17 +87,18 @@ def describe_other_lines(
             f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
             f"{values}. Enter the lines of this calibration's export."
         )
-    pairs = _pair_trims(calibration, compensation, latched)
-    if not sentences and (differences := compare_homes(pairs)):
+    homes = expected_homes(calibration, compensation, latched)
+    if not sentences and (differences := compare_homes(calibration.robot, homes, compensation)):
         sentences.append(
             f"{file} does not have the offsets that the new session states: {differences}. Enter "
-            "the lines of this calibration's export, and run `orthocal again` once more."
+            "the lines that `orthocal export --ini` writes for this calibration, and run "
+            "`orthocal again --force` once more."
         )
-    if differences := compare_joints(pairs):
+    elif differences := compare_joints(_pair_trims(calibration, compensation)):
         sentences.append(
             f"{file} differs from the lines that this calibration says to enter: "
             f"{differences}. The new session states what the file contains: measure with "
-            "these lines, or enter the others and run `orthocal again` once more."
+            "these lines, or enter the others and run `orthocal again --force` once more."
         )
     return "\n".join(sentences)
 
@@ -118,63 +119,82 @@ def compare_joints(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
     )
 
 
-def compare_homes(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
+def compare_homes(
+    robot: Robot, expected: Sequence[Sequence[float]] | None, joints: Sequence[JointTrim]
+) -> str:
     """Differences between the expected and the present HOME_OFFSET of joints; "" without any.
 
     Args:
-        joints: Drive, expected and present HOME_OFFSET of each joint; those that are not stated do
-            not differ.
+        robot: The robot.
+        expected: Possible HOME_OFFSET of each joint, the likely one first, [m, rad]; None if they
+            are unknown.
+        joints: Present HOME_OFFSET of each joint; those that are not stated do not differ.
     """
+    triples = zip(robot.drives, expected or (), joints, strict=False)
     return joined(
         [
-            f"JOINT_{i} has HOME_OFFSET {_show(drive, trim.home, joint.home)} instead of "
-            f"{_show(drive, joint.home, trim.home)}"
-            for i, (drive, joint, trim) in enumerate(joints)
-            if joint.home is not None
-            and trim.home is not None
-            and abs(joint.home - trim.home) > SAME_OFFSET
+            f"JOINT_{i} has HOME_OFFSET {drive.show(trim.home, '.4f')} instead of "
+            f"{drive.show(possible[0], '.4f')}"
+            for i, (drive, possible, trim) in enumerate(triples)
+            if trim.home is not None
+            and all(abs(home - trim.home) > SAME_OFFSET for home in possible)
         ]
     )
 
 
+def expected_homes(
+    calibration: Calibration, stated: Compensation, latched: Sequence[int] | None
+) -> list[tuple[float, ...]] | None:
+    """Possible HOME_OFFSET of each joint with the offsets to enter and a stated compensation.
+
+    It is one number if the direction of latching is known, otherwise one for each direction.
+
+    Args:
+        calibration: The calibration, with the adjustments since then.
+        stated: Compensation of the controller.
+        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
+
+    Returns:
+        Positions of each joint, [m, rad]; None if the calibrated session does not state them.
+    """
+    before = find_active_compensation(calibration, latched)
+    old = home_positions(before)
+    if old is None:
+        return None
+    now = with_latching(calibration.robot, stated, latched)
+    return [
+        (home + joint.change,) if latched else (home + joint.change, home + joint.opposite)
+        for home, joint in zip(old, find_homes(calibration, now, before, old), strict=True)
+    ]
+
+
 def states_homes(
     calibration: Calibration, stated: Compensation, latched: Sequence[int] | None
-) -> bool:
-    """True if a controller has the HOME_OFFSET that an export writes.
+) -> bool | None:
+    """True if a controller has HOME_OFFSET for the offsets to enter; None if that is unknown.
 
     Args:
         calibration: The calibration, with the adjustments since then.
         stated: Joints of the controller.
-        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
     """
-    pairs = _pair_trims(calibration, stated, latched)
-    known = all(None not in (joint.home, trim.home) for _, joint, trim in pairs)
-    return bool(pairs) and known and not compare_homes(pairs)
+    expected = expected_homes(calibration, stated, latched)
+    if expected is None or home_positions(stated) is None:
+        return None
+    return not compare_homes(calibration.robot, expected, stated)
 
 
 def _pair_trims(
-    calibration: Calibration, stated: Compensation, latched: Sequence[int] | None = None
+    calibration: Calibration, stated: Compensation
 ) -> list[tuple[Drive, JointTrim, JointTrim]]:
-    """Drives with the joint that an export writes and a stated one; empty if it writes none.
-
-    If the direction of latching is unknown, HOME_OFFSET is the nearer one of both directions.
-    """
+    """Drives with the trim that an export writes and a stated trim; empty if it writes none."""
     drives = calibration.robot.drives
-    trims = stated or (JointTrim(),) * len(drives)
     try:
-        expected = compensate_with_offsets(calibration, latched)
+        expected = compensate_with_offsets(calibration)
     except ExportError:
         return []
-    before = find_active_compensation(calibration, latched)
-    homes = None
-    if (old := home_positions(before)) is not None:
-        homes = [
-            joint.new if latched else joint.nearest(trim.home)
-            for joint, trim in zip(
-                find_homes(calibration, expected, before, old), trims, strict=True
-            )
-        ]
-    return list(zip(drives, with_homes(expected, homes), trims, strict=True))
+    trims = stated or (JointTrim(),) * len(drives)
+    return list(zip(drives, expected, trims, strict=True))
 
 
 def _describe(drive: Drive, trim: JointTrim, other: JointTrim) -> str:

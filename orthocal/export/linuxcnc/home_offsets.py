@@ -55,13 +55,6 @@ class JointHome:
         """HOME_OFFSET to enter, [unit]; None if the old one is unknown."""
         return None if self.old is None else self.old + self.change
 
-    def nearest(self, stated: float | None) -> float | None:
-        """HOME_OFFSET to enter for one of both directions of latching, nearest to a stated one."""
-        if self.old is None or stated is None:
-            return self.new
-        both = self.old + self.change, self.old + self.opposite
-        return min(both, key=lambda home: abs(home - stated))
-
     @property
     def new_limits(self) -> tuple[float, float] | None:
         """Soft limits to enter, [unit].
