@@ -59,8 +59,8 @@ def again(
         adjusted (NAME=MM,...): Mechanical adjustments since the calibration and their amounts, such
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
-            BACKLASH and COMP_FILE the session then states; default: the backlash to enter, and the
-            tables of the last session. Motions beyond its soft limits are named.
+            BACKLASH, COMP_FILE and HOME_OFFSET the session then states; default: the backlash to
+            enter, and the tables of the last session. Motions beyond its soft limits are named.
     """
     from orthocal.export.formats import note_wrong_order, require_entering, require_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints

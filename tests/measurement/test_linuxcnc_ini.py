@@ -185,6 +185,7 @@ def one(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     plan = load_plan(write_plan(folder / "plan", effects="backlash: {}"))
     truth = {f"{d}_slide.backlash": 30e-6 for d in "xyz"}
+    truth |= {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.3e-3}
     session = simulate_session(plan.with_controller(np.zeros(3)), truth, seed=1).session
     (folder / "one").mkdir()
     result = calibrate(session, "offsets", **UNJUDGED)
@@ -409,6 +410,9 @@ def test_home_offsets_are_written_and_read(folder, orthoglide):
     write_session(replace(plan, compensation=trims), folder / "written")
     controller = yaml.safe_load((folder / "written/session.yaml").read_text())["controller"]
     assert controller["home_offset_mm"] == list(HOMES)
+    assert run_orthocal(folder, "sheet", "written").returncode == 0
+    sheet = (folder / "written/sheet.html").read_text()
+    assert "HOME_OFFSET is as session.yaml states: x_slide 352.5 mm, y_slide 340.0 mm" in sheet
     read = load_plan(folder / "written").compensation
     assert np.array(home_positions(read)) / MM == pytest.approx(HOMES)
     assert compensates_alike(read, trims)

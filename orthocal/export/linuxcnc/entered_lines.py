@@ -85,13 +85,13 @@ def describe_other_lines(
         )
         sentences.append(
             f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
-            f"{values}. Enter the lines of this calibration's export."
+            f"{values}. Enter lines with the offsets of the new session."
         )
     pairs = _pair_trims(calibration, compensation, latched)
     if not sentences and (differences := compare_homes(pairs)):
         sentences.append(
             f"{file} does not have the offsets that the new session states: {differences}. Enter "
-            "the lines of this calibration's export, and run `orthocal again` once more."
+            "lines with these offsets, and run `orthocal again` once more."
         )
     if differences := compare_joints(pairs):
         sentences.append(
