@@ -38,7 +38,8 @@ def sheet(
         dwell (SECONDS): Time at each reading instead of a pause (G4).
         trigger (OUTPUT): Trigger of a logger after the dwell (default: 1 s): digital output 0 to
             63 (M64, M65 of LinuxCNC), or an M-code from M100 to M199.
-        ini (FILE): INI file of LinuxCNC; motions beyond its soft limits are named.
+        ini (FILE): INI file of LinuxCNC; motions beyond its soft limits and other HOME_OFFSET than
+            in session.yaml are named.
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
@@ -98,13 +99,14 @@ def sheet_or_problem(
 
 
 def note_contradictions(session: orthocal.Session, ini: Path | None) -> None:
-    """Note motions beyond the soft limits of an INI file, and wrong directions of homing.
+    """Note other HOME_OFFSET of an INI file, motions beyond its limits, and wrong directions.
 
     Args:
         session: The plan.
         ini: The INI file of LinuxCNC; None without one.
     """
     from orthocal.assessment.wording import joined
+    from orthocal.export.linuxcnc.entered_lines import compare_homes
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
     from orthocal.measurement.motion.approach import usual_approaches
     from orthocal.output.sheet.soft_limits import describe_beyond_limits
@@ -112,6 +114,13 @@ def note_contradictions(session: orthocal.Session, ini: Path | None) -> None:
     if ini is None:
         return
     joints = read_controller_joints(ini, session.robot)
+    trims = session.compensation, joints.compensation
+    if differences := compare_homes(zip(session.robot.drives, *trims, strict=False)):
+        put_note(
+            f"{ini} has other HOME_OFFSET than session.yaml: {differences}. If you have entered "
+            "the offsets of a calibration, prepare a session with `orthocal again`. Otherwise "
+            "state the present numbers in session.yaml (home_offset under `controller`)"
+        )
     if joints.opposed and usual_approaches(session.robot):
         verb = "has" if len(joints.opposed) == 1 else "have"
         put_note(

@@ -21,6 +21,7 @@ from orthocal import (
     calibrate,
     load_calibration,
     load_plan,
+    restore_session,
     simulate_session,
     write_calibration,
     write_session,
@@ -64,6 +65,9 @@ BACKLASH = 0.2
 
 HOMES = (352.5, 340.0, -3.25)
 """HOME_OFFSET of its joints, [mm]."""
+
+QUICK = ("--model", "offsets", "--along", "3", "--starts", "1", "--workers", "1")
+"""Options of a plan with a short search."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -444,6 +448,21 @@ def test_offsets_are_not_entered_twice(folder, at_home, plain):
         expected = rf"JOINT_0 has HOME_OFFSET {float(new):.3f} mm instead of 352.500 mm"
         assert expected in message
         assert not (folder / "twice").exists()
+
+
+def test_plans_keep_the_home_offsets_of_their_offsets(folder, at_home, plain):
+    """Offsets that were entered since the session was measured would be entered twice."""
+    write_session(restore_session(load_calibration(at_home)), folder / "first")
+    (folder / "moved.ini").write_text(plain.read_text().replace("340", "340.5"))
+    for out, words in (("plain", ["--ini", plain]), ("moved", ["--ini", "moved.ini"])):
+        done = run_orthocal(folder, "plan", "first", "--add", "1", "--out", out, *QUICK, *words)
+        assert done.returncode == 0, done.stderr
+        stated = home_positions(load_plan(folder / out).compensation)
+        assert np.array(stated) / MM == pytest.approx(HOMES)
+        sheet = run_orthocal(folder, "sheet", out, "--force", *words)
+        for text in (done.stderr, sheet.stderr):
+            expected = "JOINT_1 has HOME_OFFSET 340.500 mm instead of 340.000 mm."
+            assert (expected in " ".join(text.split())) == (out == "moved")
 
 
 def test_again_compares_home_offsets(folder, at_home, plain):
