@@ -67,7 +67,7 @@ def describe_other_lines(
         calibration: The calibration, with the adjustments since then.
         compensation: BACKLASH, COMP_FILE and HOME_OFFSET of the controller.
         offsets: Offsets that a comment of exported lines states, [m, rad]; None without it.
-        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
         entered: Offsets that the new session states, shape (n_drives,), [m, rad].
         file: Name of the file with the lines.
 
@@ -145,7 +145,7 @@ def states_homes(
     Args:
         calibration: The calibration, with the adjustments since then.
         stated: Joints of the controller.
-        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
     """
     pairs = _pair_trims(calibration, stated, latched)
     known = all(None not in (joint.home, trim.home) for _, joint, trim in pairs)
