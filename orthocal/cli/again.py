@@ -59,8 +59,8 @@ def again(
         adjusted (NAME=MM,...): Mechanical adjustments since the calibration and their amounts, such
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
-            BACKLASH and COMP_FILE the session then states; default: the backlash to enter, and the
-            tables of the last session. Motions beyond its soft limits are named.
+            BACKLASH, COMP_FILE and HOME_OFFSET the session then states; default: the backlash to
+            enter, and the tables of the last session. Motions beyond its soft limits are named.
     """
     from orthocal.export.formats import note_wrong_order, require_entering, require_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
@@ -80,10 +80,10 @@ def again(
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
-    put_out(_describe_entries(new, result, calibration, ini=ini if entered else None))
     _note_other_lines(adjusted_result, new, ini, joints)
     _note_numbers(new)
-    note_contradictions(new, ini)
+    note_contradictions(new, ini, latching=False)
+    put_out(_describe_entries(new, result, calibration, ini=ini if entered else None))
     folder, validated = quote_path(out), quote_path(calibration)
     put_out(f"  orthocal record {folder}\n  orthocal validate {validated} {folder}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, sheet.html and its programs")
@@ -97,7 +97,7 @@ def _state_joints(
 ) -> tuple[orthocal.Session, bool]:
     """Session that states the joints of the controller, and whether they have its offsets.
 
-    It states their home positions only in this case.
+    Without a file the joints are those to enter. Home positions for other offsets are not stated.
 
     Args:
         new: The session.
@@ -107,16 +107,24 @@ def _state_joints(
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.effects.compensation import with_homes
-    from orthocal.export.linuxcnc.entered_lines import states_homes, states_offsets
+    from orthocal.export.linuxcnc.entered_lines import (
+        expected_homes,
+        states_homes,
+        states_offsets,
+    )
 
     if joints is None:
-        trims, entered = compensation_to_enter(calibration), False
-        trims = trims or calibration.session.compensation
-    else:
-        trims = joints.compensation
-        entered = states_homes(adjusted, trims, joints.latched) or states_offsets(
-            joints.offsets, new.active_offsets
-        )
+        trims = compensation_to_enter(calibration) or calibration.session.compensation
+        possible = expected_homes(adjusted, trims, None)
+        certain = possible is not None and possible.shape[1] == 1
+        homes = possible[:, 0].tolist() if possible is not None and certain else None
+        if possible is not None and not certain:
+            put_note("To compare HOME_OFFSET, add --ini and the INI file with the new lines.")
+        return replace(new, compensation=with_homes(trims, homes)), False
+    trims = joints.compensation
+    entered = states_homes(adjusted, trims, joints.latched)
+    if entered is None:
+        entered = states_offsets(joints.offsets, new.active_offsets)
     return replace(new, compensation=trims if entered else with_homes(trims, None)), entered
 
 

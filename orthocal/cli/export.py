@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,7 +31,6 @@ from orthocal.units import MM, UM
 if TYPE_CHECKING:
     from orthocal.effects.compensation import JointTrim
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
-    from orthocal.robot.model import Drive
 
 ALTERNATIVES = ("joints.ini", "kinematics.ini")
 """Files that exclude each other: new HOME_OFFSET, and a module that contains the offsets."""
@@ -201,35 +200,39 @@ def _read_joints(
         if value is not None and in_file[option] is not None:
             raise ParameterError("is stated by --ini, too; state one of them", where=option)
     drives, stated_trims = calibration.robot.drives, calibration.session.compensation
+    _require_same_homes(calibration, joints.compensation, where=str(path))
     expected = stated_trims or (JointTrim(),) * len(drives)
-    pairs = list(zip(drives, expected, joints.compensation, strict=True))
-    if differences := compare_joints(pairs):
+    if differences := compare_joints(zip(drives, expected, joints.compensation, strict=True)):
         raise ParameterError(
             "has other BACKLASH or COMP_FILE than the session states under `controller` "
             f"(backlash, comp_file): {differences}. Expected is the INI file of the measurement",
             where=str(path),
         )
-    _require_same_homes(pairs, where=str(path))
     return joints
 
 
 def _require_same_homes(
-    joints: Iterable[tuple[Drive, JointTrim, JointTrim]], *, where: str
+    calibration: orthocal.Calibration, joints: Sequence[JointTrim], *, where: str
 ) -> None:
-    """Refuse other positions of HOME_OFFSET than those of the measurement: it would change twice.
+    """Refuse other HOME_OFFSET than during the measurement: offsets would be entered twice.
 
     Args:
-        joints: Drive, and HOME_OFFSET of its joint in the session and now.
+        calibration: The calibration.
+        joints: Joints with the present HOME_OFFSET.
         where: File or option, for messages.
 
     Raises:
-        ParameterError: If they differ.
+        ParameterError: If it differs.
     """
+    from orthocal.effects.compensation import home_positions
     from orthocal.export.linuxcnc.entered_lines import compare_homes
+    from orthocal.robot.model import drive_keys
 
-    if differences := compare_homes(joints):
+    homes = home_positions(calibration.session.compensation)
+    if differences := compare_homes(calibration.robot, homes, joints):
+        keys = drive_keys("home_offset", calibration.robot.drives)
         raise ParameterError(
-            "has other HOME_OFFSET than the session states under `controller` (home_offset): "
+            f"has other HOME_OFFSET than the session states (controller: {{{keys}}}): "
             f"{differences}. Expected is HOME_OFFSET during the measurement, before the offsets of "
             "this calibration were entered. If the session states it wrongly, correct it there "
             "and calibrate again",
@@ -251,11 +254,11 @@ def _home_offsets(
         return joints.home_offsets
     if text is None:
         return None
-    drives, trims = calibration.robot.drives, calibration.session.compensation
+    drives = calibration.robot.drives
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
     homes = tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
-    stated = (JointTrim(home=home) for home in homes)
-    _require_same_homes(zip(drives, trims, stated, strict=False), where="--home-offset")
+    stated = [JointTrim(home=home) for home in homes]
+    _require_same_homes(calibration, stated, where="--home-offset")
     return homes
 
 

@@ -320,8 +320,8 @@ class ControllerOptions:
     Args:
         backlash (B[,B,...]): Backlash that the controller compensates, mm or degrees: one number
             for all drives or one for each; 0 for none.
-        ini (FILE): INI file of LinuxCNC with BACKLASH and COMP_FILE, instead of --backlash.
-            Motions beyond its soft limits are named.
+        ini (FILE): INI file of LinuxCNC with BACKLASH and COMP_FILE, instead of --backlash, and
+            HOME_OFFSET. Motions beyond its soft limits are named.
     """
 
     backlash: str | None = None

@@ -150,6 +150,7 @@ def _choose(
     Raises:
         OrthocalError: If an option is invalid, or the subject does not load.
     """
+    from orthocal.effects.compensation import home_positions, with_homes
     from orthocal.effects.loading import with_effects
     from orthocal.kinematics.workspace import box_workspace
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
@@ -190,6 +191,8 @@ def _choose(
     )
     if compensation is None:
         return plan
+    if homes := home_positions(plan.session.compensation):  # they belong to its offsets
+        compensation = with_homes(compensation, homes)
     return replace(plan, session=replace(plan.session, compensation=compensation))
 
 

@@ -38,7 +38,8 @@ def sheet(
         dwell (SECONDS): Time at each reading instead of a pause (G4).
         trigger (OUTPUT): Trigger of a logger after the dwell (default: 1 s): digital output 0 to
             63 (M64, M65 of LinuxCNC), or an M-code from M100 to M199.
-        ini (FILE): INI file of LinuxCNC; motions beyond its soft limits are named.
+        ini (FILE): INI file of LinuxCNC; motions beyond its soft limits and other HOME_OFFSET than
+            in session.yaml are named.
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
@@ -97,22 +98,37 @@ def sheet_or_problem(
         return {}, f"orthocal: no measuring sheet: {e}"
 
 
-def note_contradictions(session: orthocal.Session, ini: Path | None) -> None:
-    """Note motions beyond the soft limits of an INI file, and wrong directions of homing.
+def note_contradictions(
+    session: orthocal.Session, ini: Path | None, *, latching: bool = True
+) -> None:
+    """Note other HOME_OFFSET of an INI file, motions beyond its limits, and wrong directions.
 
     Args:
         session: The plan.
         ini: The INI file of LinuxCNC; None without one.
+        latching: Whether wrong directions are named: to correct them moves the zero, so that only
+            the first session asks for it.
     """
     from orthocal.assessment.wording import joined
+    from orthocal.effects.compensation import home_positions
+    from orthocal.export.linuxcnc.entered_lines import compare_homes
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
     from orthocal.measurement.motion.approach import usual_approaches
     from orthocal.output.sheet.soft_limits import describe_beyond_limits
+    from orthocal.robot.model import drive_keys
 
     if ini is None:
         return
     joints = read_controller_joints(ini, session.robot)
-    if joints.opposed and usual_approaches(session.robot):
+    homes = home_positions(session.compensation)
+    if differences := compare_homes(session.robot, homes, joints.compensation):
+        keys = drive_keys("home_offset", session.robot.drives)
+        put_note(
+            f"{ini} has other HOME_OFFSET than session.yaml: {differences}. If you have entered "
+            "the offsets of a calibration, prepare a session with `orthocal again`. Otherwise "
+            f"state the present numbers in session.yaml: controller: {{{keys}}}"
+        )
+    if latching and joints.opposed and usual_approaches(session.robot):
         verb = "has" if len(joints.opposed) == 1 else "have"
         put_note(
             f"{ini}: {joined(joints.opposed)} {verb} a HOME_LATCH_VEL whose sign is not that of "

@@ -15,9 +15,9 @@ import numpy as np
 from orthocal.arrays import Array
 
 LATTICE = 512
-"""Points of the lattice for integrating the probability of an orthant. Its logarithm is correct to
-1e-4 (median) and 0.04 (largest) for three variables of any correlation and probabilities above
-1e-5."""
+"""Points of the lattice for integrating the probability of an orthant. For three variables of any
+correlation and probabilities above 1e-5, the error of the logarithm is 1e-3 (median), below 0.02 in
+99 % of 700 cases, and 0.24 in the worst one."""
 
 
 def normal_quantile(share: float) -> float:
@@ -40,7 +40,8 @@ def median_of_largest(stds: Array) -> float:
 def log_positive_share(mean: Array, covariance: Array) -> float:
     """Logarithm of the probability that all variables of a normal distribution are positive.
 
-    The variables x = m + L z are separated and integrated over a fixed lattice (Genz, 1992).
+    The variables x = m + L z are separated and integrated over a fixed lattice (Genz, 1992), the
+    least probable variable first: in another order the error is larger for correlated variables.
 
     Args:
         mean: Mean m, shape (k,).
@@ -48,7 +49,8 @@ def log_positive_share(mean: Array, covariance: Array) -> float:
     """
     from scipy.special import log_ndtr, ndtri_exp
 
-    factor = np.linalg.cholesky(covariance)
+    order = np.argsort(mean / np.sqrt(np.diag(covariance)))
+    mean, factor = mean[order], np.linalg.cholesky(covariance[np.ix_(order, order)])
     log_points = _log_lattice(mean.size - 1)
     z = np.zeros((LATTICE, mean.size))
     log_probabilities = np.zeros(LATTICE)
@@ -61,7 +63,7 @@ def log_positive_share(mean: Array, covariance: Array) -> float:
 
 
 def log_positive_share_of_independent(mean: Array, std: float) -> float:
-    """The same of independent variables with one standard deviation.
+    """Logarithm of this probability for independent variables with one standard deviation.
 
     Args:
         mean: Their means, shape (k,).

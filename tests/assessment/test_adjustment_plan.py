@@ -265,4 +265,8 @@ def test_command_and_report_list_the_planned_adjustments(calibration, tmp_path):
     assert code == 0
     assert "Do not type them as HOME_OFFSET: it changes by " in out
     assert "orthocal export" not in out  # which knows no adjustments
+    ini = tmp_path / "joints.ini"
+    ini.write_text("# controller: {offsets_mm: [9, 9, 9]}\n[JOINT_0]\n[JOINT_1]\n[JOINT_2]\n")
+    words = ("--adjusted", f"{names[0]}=0.12", "--ini", ini, "--out", new, "--force")
+    assert "export" not in run("again", tmp_path, *words)[2].partition("other offsets")[2]
     assert f"adjusted_mm: {{{names[0]}: 0.12}}" in (new / "session.yaml").read_text()

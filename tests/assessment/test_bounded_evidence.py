@@ -17,7 +17,6 @@ from orthocal.hypotheses.likelihood import build_likelihood
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.statistics.distributions import (
-    LATTICE,
     log_positive_share,
     log_positive_share_of_independent,
 )
@@ -39,7 +38,7 @@ def test_the_share_of_several_variables_is_that_of_draws(size):
     covariance, mean = root @ root.T, rng.normal(size=size) + 0.5
     drawn = rng.multivariate_normal(mean, covariance, size=DRAWS)
     share = (drawn > 0.0).all(axis=1).mean()
-    error = 4.0 * math.sqrt(share / DRAWS) + share * 20.0 / LATTICE
+    error = 4.0 * math.sqrt(share / DRAWS) + share * 0.01
     assert math.exp(log_positive_share(mean, covariance)) == pytest.approx(share, abs=error)
     alone = norm.logcdf(mean / np.sqrt(np.diag(covariance))).sum()
     assert log_positive_share_of_independent(mean, 2.0) == pytest.approx(
@@ -47,6 +46,15 @@ def test_the_share_of_several_variables_is_that_of_draws(size):
     )
     apart = np.diag(np.diag(covariance))
     assert log_positive_share(mean, apart) == pytest.approx(alone, abs=1e-3)
+
+
+@pytest.mark.parametrize("correlation", [-0.4, 0.5, 0.96])
+@pytest.mark.parametrize("mean", [(2.0, -2.0), (1.5, 0.0, -1.5), (3.0, -2.0, 1.0)])
+def test_the_share_of_correlated_variables_is_that_of_scipy(mean, correlation):
+    covariance = np.full((len(mean), len(mean)), correlation)
+    np.fill_diagonal(covariance, 1.0)
+    expected = multivariate_normal.logcdf(mean, cov=covariance)
+    assert log_positive_share(np.array(mean), covariance) == pytest.approx(expected, abs=5e-3)
 
 
 @pytest.mark.parametrize("true", [-0.7, 0.1, 2.0])

@@ -21,10 +21,12 @@ from orthocal import (
     calibrate,
     load_calibration,
     load_plan,
+    restore_session,
     simulate_session,
     write_calibration,
     write_session,
 )
+from orthocal.assessment.controller_entries import find_backlash
 from orthocal.cli.sheet import note_contradictions
 from orthocal.effects.compensation import (
     JointTrim,
@@ -64,6 +66,9 @@ BACKLASH = 0.2
 
 HOMES = (352.5, 340.0, -3.25)
 """HOME_OFFSET of its joints, [mm]."""
+
+QUICK = ("--model", "offsets", "--along", "3", "--starts", "1", "--workers", "1")
+"""Options of a plan with a short search."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -185,6 +190,7 @@ def one(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     plan = load_plan(write_plan(folder / "plan", effects="backlash: {}"))
     truth = {f"{d}_slide.backlash": 30e-6 for d in "xyz"}
+    truth |= {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.3e-3}
     session = simulate_session(plan.with_controller(np.zeros(3)), truth, seed=1).session
     (folder / "one").mkdir()
     result = calibrate(session, "offsets", **UNJUDGED)
@@ -409,6 +415,9 @@ def test_home_offsets_are_written_and_read(folder, orthoglide):
     write_session(replace(plan, compensation=trims), folder / "written")
     controller = yaml.safe_load((folder / "written/session.yaml").read_text())["controller"]
     assert controller["home_offset_mm"] == list(HOMES)
+    assert run_orthocal(folder, "sheet", "written").returncode == 0
+    sheet = (folder / "written/sheet.html").read_text()
+    assert "HOME_OFFSET is as session.yaml states: x_slide 352.5 mm, y_slide 340.0 mm" in sheet
     read = load_plan(folder / "written").compensation
     assert np.array(home_positions(read)) / MM == pytest.approx(HOMES)
     assert compensates_alike(read, trims)
@@ -437,9 +446,24 @@ def test_offsets_are_not_entered_twice(folder, at_home, plain):
         message = " ".join(done.stderr.split())
         assert done.returncode == 2
         assert f"{name}: has other HOME_OFFSET" in message
-        expected = rf"JOINT_0 has HOME_OFFSET {float(new):.3f} mm instead of 352.500 mm"
+        expected = f"JOINT_0 has HOME_OFFSET {float(new):.4f} mm instead of 352.5000 mm"
         assert expected in message
         assert not (folder / "twice").exists()
+
+
+def test_plans_keep_the_home_offsets_of_their_offsets(folder, at_home, plain):
+    """Offsets that were entered since the session was measured would be entered twice."""
+    write_session(restore_session(load_calibration(at_home)), folder / "first")
+    (folder / "moved.ini").write_text(plain.read_text().replace("340", "340.5"))
+    for out, words in (("plain", ["--ini", plain]), ("moved", ["--ini", "moved.ini"])):
+        done = run_orthocal(folder, "plan", "first", "--add", "1", "--out", out, *QUICK, *words)
+        assert done.returncode == 0, done.stderr
+        stated = home_positions(load_plan(folder / out).compensation)
+        assert np.array(stated) / MM == pytest.approx(HOMES)
+        sheet = run_orthocal(folder, "sheet", out, "--force", *words)
+        for text in (done.stderr, sheet.stderr):
+            expected = "JOINT_1 has HOME_OFFSET 340.5000 mm instead of 340.0000 mm."
+            assert (expected in " ".join(text.split())) == (out == "moved")
 
 
 def test_again_compares_home_offsets(folder, at_home, plain):
@@ -455,17 +479,61 @@ def test_again_compares_home_offsets(folder, at_home, plain):
         assert "instead of" not in done.stderr
         stated = home_positions(load_plan(folder / f"second-{k}").compensation)
         assert np.array(stated) / MM == pytest.approx(found)
-    done = run_orthocal(folder, "again", at_home, "--out", "third", "--ini", plain)
-    text = " ".join(done.stderr.split())
-    assert done.returncode == 0
-    assert "does not have the offsets that the new session states: JOINT_0 has" in text
-    assert f"HOME_OFFSET 352.500 mm instead of {found[0]:.3f} mm" in text
-    assert home_positions(load_plan(folder / "third").compensation) is None
+    # one wrong number, whatever the comment states
+    (folder / "wrong.ini").write_text(re.sub("(HOME_OFFSET = )3", r"\g<1>9", lines, count=1))
+    result = load_calibration(at_home)
+    change = result.robot.drives[0].direction * round(result.assessment.entries[0].enter, 6)
+    own = HOMES[0] + change / MM  # without BACKLASH
+    for ini, number in (("wrong.ini", found[0]), (plain, own)):
+        done = run_orthocal(folder, "again", at_home, "--out", "x", "--force", "--ini", ini)
+        assert done.returncode == 0
+        assert "The lines of" not in done.stdout
+        text = " ".join(done.stderr.split())
+        assert "does not have the offsets that the new session states: JOINT_0 has" in text
+        place = r"JOINT_0 has HOME_OFFSET \S+ mm instead of (\S+ mm, or )?"
+        assert re.search(rf"{place}{number:.4f} mm", text)
+        assert "measure with these lines" not in text
+        assert home_positions(load_plan(folder / "x").compensation) is None
+
+
+def test_home_offsets_to_enter_depend_on_the_backlash_of_the_file(folder, at_home, plain):
+    """HOME_OFFSET contains half of BACKLASH: other BACKLASH, other numbers for the same offsets."""
+    result, text = load_calibration(at_home), plain.read_text()
+    for home, drive, entry in zip(
+        HOMES, result.robot.drives, result.assessment.entries, strict=True
+    ):
+        new = home + drive.direction * entry.enter / MM
+        text = text.replace(f"HOME_OFFSET = {home:g}", f"HOME_OFFSET = {new:.4f}")
+    (folder / "own.ini").write_text(text)
+    done = run_orthocal(folder, "again", at_home, "--out", "second", "--ini", "own.ini")
+    assert "The lines of own.ini contain them" in " ".join(done.stdout.split())
+    assert "HOME_OFFSET" not in done.stderr
+    assert "BACKLASH 0 or none instead of" in " ".join(done.stderr.split())
+    assert home_positions(load_plan(folder / "second").compensation) is not None
+
+
+def test_again_states_home_offsets_that_it_knows(folder, at_home):
+    """Half of a changed backlash has the sign of HOME_LATCH_VEL, which only a file states."""
+    result = load_calibration(at_home)
+    done = run_orthocal(folder, "again", at_home, "--out", "second")
+    assert "To compare HOME_OFFSET, add --ini" in done.stderr
+    assert home_positions(load_plan(folder / "second").compensation) is None
+    trims = with_homes([JointTrim(e.enter) for e in find_backlash(result)], np.array(HOMES) * MM)
+    known = replace(result, session=replace(result.session, compensation=trims))
+    possible = entered_lines.expected_homes(known, trims, None)
+    changes = [
+        e.enter * d.direction
+        for e, d in zip(result.assessment.entries, result.robot.drives, strict=True)
+    ]
+    rounded = np.array(HOMES) * MM + np.round(changes, 6)
+    assert possible[:, 0] == pytest.approx(rounded, abs=1e-12)
+    assert possible.shape == (3, 1)
 
 
 def test_small_differences_are_shown_with_all_their_decimals(fivebar, monkeypatch):
     """5 µrad are 0.0002865 degrees."""
     monkeypatch.setattr(entered_lines, "_pair_trims", lambda *_: [])
+    monkeypatch.setattr(entered_lines, "expected_homes", lambda *_: None)
     entered = np.radians([0.1, 0.2])
     stated = (entered + np.array([5e-6, 0.0])).tolist()
     text = entered_lines.describe_other_lines(

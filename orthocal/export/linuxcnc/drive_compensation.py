@@ -147,7 +147,23 @@ def find_active_compensation(
     Raises:
         ParameterError: If the numbers of directions and drives differ.
     """
-    drives = calibration.robot.drives
+    return with_latching(calibration.robot, calibration.session.compensation, latched)
+
+
+def with_latching(
+    robot: Robot, trims: Sequence[JointTrim], latched: Sequence[int] | None
+) -> tuple[JointCompensation, ...]:
+    """Compensation of joints whose homing latches in some direction, in the order of the drives.
+
+    Args:
+        robot: The robot.
+        trims: Compensation of the joints; empty for none.
+        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+
+    Raises:
+        ParameterError: If the numbers of directions and drives differ.
+    """
+    drives = robot.drives
     signs = (1,) * len(drives) if latched is None else tuple(latched)
     if len(signs) != len(drives):
         names = ", ".join(d.name for d in drives)
@@ -156,10 +172,9 @@ def find_active_compensation(
             f"({names}), such as +,+,-",
             where="--latched",
         )
-    trims = calibration.session.compensation or (JointTrim(),) * len(signs)
     return tuple(
         JointCompensation(trim.backlash, trim.table, trim.home, latched=sign)
-        for trim, sign in zip(trims, signs, strict=True)
+        for trim, sign in zip(trims or (JointTrim(),) * len(signs), signs, strict=True)
     )
 
 

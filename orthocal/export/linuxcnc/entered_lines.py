@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.assessment.wording import joined
@@ -67,7 +68,7 @@ def describe_other_lines(
         calibration: The calibration, with the adjustments since then.
         compensation: BACKLASH, COMP_FILE and HOME_OFFSET of the controller.
         offsets: Offsets that a comment of exported lines states, [m, rad]; None without it.
-        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
         entered: Offsets that the new session states, shape (n_drives,), [m, rad].
         file: Name of the file with the lines.
 
@@ -85,14 +86,13 @@ def describe_other_lines(
         )
         sentences.append(
             f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
-            f"{values}. Enter the lines of this calibration's export."
+            f"{values}. Enter lines with the offsets of the new session."
         )
     homes = expected_homes(calibration, compensation, latched)
     if not sentences and (differences := compare_homes(calibration.robot, homes, compensation)):
         sentences.append(
             f"{file} does not have the offsets that the new session states: {differences}. Enter "
-            "the lines that `orthocal export --ini` writes for this calibration, and run "
-            "`orthocal again --force` once more."
+            "lines with these offsets, and run `orthocal again --force` once more."
         )
     elif differences := compare_joints(_pair_trims(calibration, compensation)):
         sentences.append(
@@ -119,35 +119,47 @@ def compare_joints(joints: Iterable[tuple[Drive, JointTrim, JointTrim]]) -> str:
     )
 
 
-def compare_homes(
-    robot: Robot, expected: Sequence[Sequence[float]] | None, joints: Sequence[JointTrim]
-) -> str:
+def compare_homes(robot: Robot, expected: ArrayLike | None, joints: Sequence[JointTrim]) -> str:
     """Differences between the expected and the present HOME_OFFSET of joints; "" without any.
 
     Args:
         robot: The robot.
-        expected: Possible HOME_OFFSET of each joint, the likely one first, [m, rad]; None if they
-            are unknown.
+        expected: HOME_OFFSET of each joint, shape (n_drives,), or all possible ones, the likely one
+            first, shape (n_drives, n), [m, rad]; None if they are unknown.
         joints: Present HOME_OFFSET of each joint; those that are not stated do not differ.
     """
-    triples = zip(robot.drives, expected or (), joints, strict=False)
+    if expected is None:
+        return ""
+    possible = np.reshape(np.asarray(expected, dtype=np.float64), (len(robot.drives), -1))
     return joined(
         [
             f"JOINT_{i} has HOME_OFFSET {drive.show(trim.home, '.4f')} instead of "
-            f"{drive.show(possible[0], '.4f')}"
-            for i, (drive, possible, trim) in enumerate(triples)
-            if trim.home is not None
-            and all(abs(home - trim.home) > SAME_OFFSET for home in possible)
+            f"{_either(drive, homes)}"
+            for i, (drive, homes, trim) in enumerate(
+                zip(robot.drives, possible, joints, strict=False)
+            )
+            if trim.home is not None and np.abs(homes - trim.home).min() > SAME_OFFSET
         ]
+    )
+
+
+def _either(drive: Drive, homes: Array) -> str:
+    """One position, or those of both directions of latching if they differ, shape (n,)."""
+    first, *other = [drive.show(home, ".4f") for home in homes.tolist()]
+    return (
+        first
+        if other in ([], [first])
+        else f"{first}, or {other[0]} with a negative HOME_LATCH_VEL"
     )
 
 
 def expected_homes(
     calibration: Calibration, stated: Compensation, latched: Sequence[int] | None
-) -> list[tuple[float, ...]] | None:
+) -> Array | None:
     """Possible HOME_OFFSET of each joint with the offsets to enter and a stated compensation.
 
-    It is one number if the direction of latching is known, otherwise one for each direction.
+    It is one number if the direction of latching is known or does not matter, otherwise one for
+    each direction.
 
     Args:
         calibration: The calibration, with the adjustments since then.
@@ -155,17 +167,18 @@ def expected_homes(
         latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
 
     Returns:
-        Positions of each joint, [m, rad]; None if the calibrated session does not state them.
+        Shape (n_drives, 1) or (n_drives, 2), [m, rad]; None if the calibrated session does not
+        state HOME_OFFSET.
     """
     before = find_active_compensation(calibration, latched)
     old = home_positions(before)
     if old is None:
         return None
     now = with_latching(calibration.robot, stated, latched)
-    return [
-        (home + joint.change,) if latched else (home + joint.change, home + joint.opposite)
-        for home, joint in zip(old, find_homes(calibration, now, before, old), strict=True)
-    ]
+    changes = [[h.change, h.opposite] for h in find_homes(calibration, now, before, old)]
+    homes = np.array(old)[:, None] + np.array(changes)
+    same = np.ptp(homes, axis=1).max(initial=0.0) <= SAME_OFFSET
+    return np.asarray(homes[:, :1] if latched or same else homes)
 
 
 def states_homes(

@@ -20,7 +20,7 @@ from orthocal.measurement.files.session_keys import (
     keys_for_unit,
 )
 from orthocal.printers.settings import DeltaSettings
-from orthocal.robot.model import Drive, Robot
+from orthocal.robot.model import Drive, Robot, drive_keys
 from orthocal.units import Unit
 
 KINDS: dict[Unit, str] = {"m": "prismatic", "rad": "revolute"}
@@ -76,8 +76,6 @@ def build_compensation(
 ) -> Compensation:
     """What the controller compensates, and home positions of its joints; empty if not stated.
 
-    If home positions alone are stated, nothing is compensated.
-
     Args:
         keys: Keys under `controller`; None if absent.
         robot: The robot.
@@ -85,13 +83,21 @@ def build_compensation(
         where: File and key, for messages.
 
     Raises:
-        SessionError: If numbers or tables and drives do not match, or a table is wrong.
+        SessionError: If numbers or tables and drives do not match, a table is wrong, or home
+            positions are stated without the compensation.
     """
     if keys is None:
         return ()
     backlash = _read_drive_values(keys, BACKLASH_KEYS, "backlash", robot, where)
     homes = _read_drive_values(keys, HOME_KEYS, "home offset", robot, where)
-    if backlash is None and homes is None and keys.comp_file is None:
+    if backlash is None and keys.comp_file is None:
+        if homes is not None:
+            stated = drive_keys("backlash", robot.drives)
+            raise SessionError(
+                "states home_offset without the backlash; for a controller that compensates "
+                f"nothing add {stated}",
+                where=where,
+            )
         return ()
     names = keys.comp_file or [None] * len(robot.drives)
     table_key = f"{where}.comp_file"

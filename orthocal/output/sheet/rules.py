@@ -22,7 +22,7 @@ from orthocal.sensors.protocol import (
     tool_path,
 )
 from orthocal.session.session import Session
-from orthocal.units import DRIVE_UNITS, LIMIT, MM
+from orthocal.units import DRIVE_UNITS, LIMIT, MM, tidy
 
 PROBING = (
     "A probe reaches each posture by the motion towards its surface. The programs stop "
@@ -150,10 +150,14 @@ def _homes(session: Session) -> str:
     if homes is None:
         return ""
     drives = session.robot.drives
-    stated = ", ".join(f"{d.name} {d.show(h)}" for d, h in zip(drives, homes, strict=True))
+    stated = ", ".join(
+        f"{d.name} {tidy(h / d.joint_size)} {d.joint_unit}"
+        for d, h in zip(drives, homes, strict=True)
+    )
     return (
-        f"Check that HOME_OFFSET is as session.yaml states: {stated}. If you have changed it, "
-        "write the present numbers there (home_offset under `controller`)."
+        f"Check that HOME_OFFSET is as session.yaml states: {stated}. If not, state the present "
+        f"numbers there (controller: {{{drive_keys('home_offset', drives)}}}), and the offsets "
+        "that they contain."
     )
 
 
