@@ -230,7 +230,7 @@ def _require_same_homes(
 
     homes = home_positions(calibration.session.compensation)
     if differences := compare_homes(calibration.robot, homes, joints):
-        keys = drive_keys("home_offset", calibration.robot.drives)
+        keys = drive_keys("home_offset", calibration.robot.drives, homes)
         raise ParameterError(
             f"has other HOME_OFFSET than the session states (controller: {{{keys}}}): "
             f"{differences}. Expected is HOME_OFFSET during the measurement, before the offsets of "

@@ -122,11 +122,11 @@ def note_contradictions(
     joints = read_controller_joints(ini, session.robot)
     homes = home_positions(session.compensation)
     if differences := compare_homes(session.robot, homes, joints.compensation):
-        keys = drive_keys("home_offset", session.robot.drives)
+        keys = drive_keys("home_offset", session.robot.drives, homes)
         put_note(
             f"{ini} has other HOME_OFFSET than session.yaml: {differences}. If you have entered "
             "the offsets of a calibration, prepare a session with `orthocal again`. Otherwise "
-            f"state the present numbers in session.yaml: controller: {{{keys}}}"
+            f"state the present numbers in session.yaml in place of {keys}"
         )
     if latching and joints.opposed and usual_approaches(session.robot):
         verb = "has" if len(joints.opposed) == 1 else "have"

@@ -489,7 +489,7 @@ def test_again_compares_home_offsets(folder, at_home, plain):
         assert done.returncode == 0
         assert "The lines of" not in done.stdout
         text = " ".join(done.stderr.split())
-        assert "does not have the offsets that the new session states: JOINT_0 has" in text
+        assert "does not have the offsets that the new session states. With its" in text
         place = r"JOINT_0 has HOME_OFFSET \S+ mm instead of (\S+ mm, or )?"
         assert re.search(rf"{place}{number:.4f} mm", text)
         assert "measure with these lines" not in text

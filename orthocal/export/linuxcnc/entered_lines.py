@@ -91,8 +91,9 @@ def describe_other_lines(
     homes = expected_homes(calibration, compensation, latched)
     if not sentences and (differences := compare_homes(calibration.robot, homes, compensation)):
         sentences.append(
-            f"{file} does not have the offsets that the new session states: {differences}. Enter "
-            "lines with these offsets, and run `orthocal again --force` once more."
+            f"{file} does not have the offsets that the new session states. With its BACKLASH, "
+            f"{differences}. Enter lines with these offsets, and run `orthocal again --force` "
+            "once more."
         )
     elif differences := compare_joints(_pair_trims(calibration, compensation)):
         sentences.append(

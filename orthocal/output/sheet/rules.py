@@ -156,8 +156,8 @@ def _homes(session: Session) -> str:
     )
     return (
         f"Check that HOME_OFFSET is as session.yaml states: {stated}. If not, state the present "
-        f"numbers there (controller: {{{drive_keys('home_offset', drives)}}}), and the offsets "
-        "that they contain."
+        f"numbers there ({drive_keys('home_offset', drives, homes)}), and the offsets that they "
+        "contain."
     )
 
 
