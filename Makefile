@@ -1,8 +1,7 @@
 # Everything a fresh machine with Python 3.11 or newer and make needs.
 #   make calibrate   set up, and calibrate the paper's Experiment 2
 #   make test        set up with the test tools, and run all checks that need Python alone
-#   make acceptance  the wheel, commands of the pages, pages in a browser
-#   make linuxcnc    exports in LinuxCNC
+#   make acceptance  the wheel, commands of the pages, pages in a browser, exports in LinuxCNC
 #   make benchmarks  ratios of processor times
 #   make smoke       a few tests on other Pythons and with the lowest versions of dependencies
 #   make docs        set up with the tools for pages, and write them to out/docs
@@ -11,9 +10,8 @@ PYTHON ?= python3
 VENV ?= .venv
 SESSION ?= examples/table1/experiment-2
 # what `make test` runs; continuous integration runs the acceptance tests and the benchmarks, too
-MARKS ?= not smoke and not acceptance and not linuxcnc
+MARKS ?= not smoke and not acceptance
 BESIDE ?=
-THEN_BESIDE ?=
 # one more than there are cores: some tests wait for pages and processes
 WORKERS ?= $(shell expr 1 + `getconf _NPROCESSORS_ONLN`)
 
@@ -33,7 +31,7 @@ PYTEST_IN_PARALLEL = $(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --di
 
 unexport PYTHONDONTWRITEBYTECODE  # processes of tests do not compile what others have compiled
 
-.PHONY: calibrate test compiled suite acceptance linuxcnc benchmarks smoke check docs clean
+.PHONY: calibrate test compiled suite acceptance benchmarks smoke check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
@@ -41,7 +39,7 @@ calibrate: $(INSTALLED)
 test: $(TESTED)
 	@# two processes at first: a benchmark compares times
 	$(MAKE) --jobs 2 --output-sync check $(BESIDE) compiled
-	$(MAKE) --jobs 2 --output-sync=line suite $(THEN_BESIDE)
+	$(MAKE) suite
 
 compiled: $(TESTED)  # the tests, once for all workers
 	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
@@ -51,9 +49,6 @@ suite: $(TESTED)
 
 acceptance: $(TESTED)
 	$(PYTEST_IN_PARALLEL) -m acceptance
-
-linuxcnc: $(TESTED)  # in one process: it can run once at a time
-	$(VENV)/bin/python -m pytest -m linuxcnc tests/export tests/measurement
 
 benchmarks: $(TESTED)  # in one process: they compare seconds of the processor
 	$(VENV)/bin/python -m pytest tests/benchmarks

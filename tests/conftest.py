@@ -65,11 +65,20 @@ MORE_GARBAGE = (20_000, 20, 20)
 LONGEST = ("test_examples.py", "test_command_line_use.py", "test_fuzz.py")
 """Files with tests that take as long as a hundred others."""
 
+IN_LINUXCNC = (
+    "test_drive_compensation.py",
+    "test_linuxcnc.py",
+    "test_module_conditions.py",
+    "test_motion.py",
+)
+"""Files that run LinuxCNC: one after the other on a worker, they do not wait for its lock."""
+
 
 def pytest_collection_modifyitems(items):
     """What takes longest begins first: at the end others would wait for it."""
-    place = {name: i for i, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.name, len(LONGEST)))
+    first = (*LONGEST, *IN_LINUXCNC)
+    place = {name: i for i, name in enumerate(first)}
+    items.sort(key=lambda item: place.get(item.path.name, len(first)))
 
 
 def pytest_collection_finish():

@@ -196,7 +196,7 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
     return points[(away[0] > TAKEN_UP) & (np.min(away, axis=0) > REVERSING)]
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_module_and_backlash_keep_the_path(calibration, tmp_path):
     require_linuxcnc()
     options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED)
@@ -206,7 +206,7 @@ def test_module_and_backlash_keep_the_path(calibration, tmp_path):
     require_followed(from_pieces(actual, *PATH), PATH_ERROR, COUNTS)
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     """The module of a machine without errors stands for nominal kinematics."""
     require_linuxcnc()
@@ -493,7 +493,7 @@ def test_a_backlash_that_does_not_change_needs_no_direction_of_latching(calibrat
     assert "as during the measurement" in same
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):
     """Homed at the switch, it would refuse to move if HOME_OFFSET were outside the soft limits.
 
@@ -606,7 +606,7 @@ def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_p
             assert np.abs(missed).max() < stated * 1e-6 + 0.05e-6
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_module_and_tables_keep_the_path(under_tables, tmp_path):
     require_linuxcnc()
     under, entered = under_tables

@@ -520,7 +520,7 @@ def joints_of(calibration, home_offsets):
     ]
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
     """The calibrated machine follows a circle off centre and lines in space."""
     require_linuxcnc()
@@ -579,7 +579,7 @@ def filtered(root, full, tmp_path):
     return open_program
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filtered, tmp_path):
     """With nominal kinematics, the tip of the calibrated machine follows a circle and lines."""
     centre, radius = (10.0, -8.0, 15.0), 5.0
@@ -622,7 +622,7 @@ def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filt
     assert from_pieces(unfiltered, *path).min(axis=0).max() > 0.05 * MM
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_window_shows_the_message_of_a_refused_program(filtered):
     code, message, _, text = filtered(["G21 G0 X0 Y0 Z0", "G81 X1 Z-1 R1 F100"])
     assert (code, text) == (2, "")
@@ -634,7 +634,7 @@ def test_linuxcnc_window_shows_the_message_of_a_refused_program(filtered):
     assert filtered(["G0 X0 Y0 Z0"], name="PART.NGC")[0] is None
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
     """One joint counts up, two count down."""
     require_linuxcnc()

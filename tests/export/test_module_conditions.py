@@ -228,7 +228,7 @@ FOLLOWED = 0.2e-6
 """Tolerance of points at rest, [m]: 0.1 µm of the module, and homing of three drives."""
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_joints_follow_the_pin_in_linuxcnc(tmp_path):
     """The pin changes while the machine is at rest at two points."""
     require_linuxcnc()

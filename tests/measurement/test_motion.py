@@ -478,7 +478,7 @@ def _run_nominal(session, program, folder, before=((),), *, output=False):
     return run_programs(runs, joints, lines=lines, module=folder, output=output)
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_joints_do_not_depend_on_offsets_rotation_or_tool_length(small, motions, tmp_path):
     """At every pause LinuxCNC's joints equal those in the program's comment, on nominal legs."""
     robot = small.robot
@@ -495,7 +495,7 @@ STANDSTILL = 50
 """Servo periods without motion in a pause."""
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path):
     """Slides that stay behind by half of the backlash, however they went before."""
     motion = plan_motion(sided)[0]
@@ -536,7 +536,7 @@ def bar(directory):
     return replace(session, readings=tuple(replace(r, cycle=i + 1) for i, r in enumerate(rows)))
 
 
-@pytest.mark.linuxcnc
+@pytest.mark.acceptance
 def test_linuxcnc_triggers_a_logger_in_every_posture_of_a_ball_bar(small, bar, tmp_path):
     """At each trigger the slides rest in the posture, and the bar shows its simulated reading."""
     bar = replace(bar, readings=bar.readings[3:])  # quarters of circles
