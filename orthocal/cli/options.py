@@ -203,8 +203,8 @@ Free = Annotated[
     list[str] | None,
     Option(
         metavar="PATTERNS",
-        help="Errors to identify, by name or pattern (* stands for any text), with --model in "
-        "addition to its errors; '!' excludes: --model full --free '!*_fork.*'.",
+        help="Errors to identify, by name or pattern; * stands for any text. With --model they "
+        "are additional; '!' excludes: --model full --free '!*_fork.*'.",
     ),
 ]
 Tolerances = Annotated[

@@ -146,12 +146,8 @@ def compare_homes(robot: Robot, expected: ArrayLike | None, joints: Sequence[Joi
 
 def _either(drive: Drive, homes: Array) -> str:
     """One position, or those of both directions of latching if they differ, shape (n,)."""
-    first, *other = [drive.show(home, ".4f") for home in homes.tolist()]
-    return (
-        first
-        if other in ([], [first])
-        else f"{first}, or {other[0]} with a negative HOME_LATCH_VEL"
-    )
+    shown = dict.fromkeys(drive.show(home, ".4f") for home in homes.tolist())
+    return ", or ".join(shown) + " with a negative HOME_LATCH_VEL" * (len(shown) > 1)
 
 
 def expected_homes(

@@ -15,6 +15,7 @@ from orthocal.effects.compensation import (
     MAX_COMP_FILE_ENTRIES,
     Compensation,
     JointTrim,
+    home_positions,
     with_homes,
 )
 from orthocal.errors import ParameterError, SessionError
@@ -44,19 +45,22 @@ UNIT_WORDS = {"mm": ("mm", "metric"), "deg": ("deg", "degree")}
 class ControllerJoints:
     """Joints of a controller, in the order of the drives."""
 
-    home_offsets: tuple[float, ...] | None
-    """HOME_OFFSET, [m, rad]; None if no joint states it or HOME_LATCH_VEL, as in a fragment that
-    states changes only."""
     limits: tuple[tuple[float, float], ...]
     """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
     latched: tuple[int, ...] | None
     """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
     compensation: Compensation
-    """BACKLASH, COMP_FILE and HOME_OFFSET of each joint."""
+    """BACKLASH, COMP_FILE and HOME_OFFSET of each joint. HOME_OFFSET is None if no joint states it
+    or HOME_LATCH_VEL, as in a fragment that states changes only."""
     offsets: tuple[float, ...] | None = None
     """Offsets of the slides that the comment of exported lines states, [m, rad]; None otherwise."""
     opposed: tuple[str, ...] = ()
     """Sections of joints whose HOME_LATCH_VEL and HOME_SEARCH_VEL have opposite signs."""
+
+    @property
+    def home_offsets(self) -> tuple[float, ...] | None:
+        """HOME_OFFSET, [m, rad]; None if not stated."""
+        return home_positions(self.compensation)
 
 
 def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
@@ -90,12 +94,10 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
     known = stated or any(home is not None for home in homes)
-    home_offsets = tuple(home or 0.0 for home in homes) if known else None
     return ControllerJoints(
-        home_offsets,
         limits,
         tuple(latch or 1 for latch in latched) if stated else None,
-        with_homes(trims, home_offsets),
+        with_homes(trims, [home or 0.0 for home in homes] if known else None),
         None if stated else _read_offsets(text, robot.drives),
         tuple(opposed),
     )

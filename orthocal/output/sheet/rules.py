@@ -14,6 +14,7 @@ from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length
 from orthocal.measurement.motion.stops import SetupMotion
 from orthocal.observation.conditions import needed_conditions
 from orthocal.output.sheet.coordinates import joint_list, show_number
+from orthocal.output.text.layout import true_minus
 from orthocal.robot.model import PARALLEL_SINE, Robot, drive_keys, name_coordinates
 from orthocal.sensors.protocol import (
     PROBING_DISTANCE,
@@ -151,13 +152,13 @@ def _homes(session: Session) -> str:
         return ""
     drives = session.robot.drives
     stated = ", ".join(
-        f"{d.name} {tidy(h / d.joint_size)} {d.joint_unit}"
+        f"{d.name} {true_minus(str(tidy(h / d.joint_size)))} {d.joint_unit}"
         for d, h in zip(drives, homes, strict=True)
     )
+    keys = ", ".join(dict.fromkeys(f"home_offset_{d.joint_unit}" for d in drives))
     return (
         f"Check that HOME_OFFSET is as session.yaml states: {stated}. If not, state the present "
-        f"numbers there ({drive_keys('home_offset', drives, homes)}), and the offsets that they "
-        "contain."
+        f"numbers there ({keys}), and the offsets that they contain."
     )
 
 
