@@ -12,10 +12,6 @@ from typer import Argument, Exit
 import orthocal
 from orthocal.cli.forward import put_assumed
 from orthocal.cli.options import (
-    Anyway,
-    CalibrationPath,
-    HalfSideMm,
-    Json,
     UseOptions,
     command,
     require_between,
@@ -31,13 +27,13 @@ if TYPE_CHECKING:
 
 @command()
 def accuracy(
-    calibration: CalibrationPath,
+    calibration: Path,
     points: Annotated[Path | None, Argument()] = None,
-    half_side_mm: HalfSideMm = None,
+    half_side_mm: float | None = None,
     *,
     use: UseOptions,
-    json: Json = False,
-    anyway: Anyway = False,
+    json: bool = False,
+    anyway: bool = False,
 ) -> None:
     """Print the tool error over the workspace, or at points.
 

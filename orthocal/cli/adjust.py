@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import orthocal
-from orthocal.cli.options import Anyway, CalibrationPath, Details, Json, command, split_globs
+from orthocal.cli.options import command, split_globs
 from orthocal.cli.printing import deliver
 from orthocal.errors import ParameterError
 
 
 @command()
 def adjust(
-    calibration: CalibrationPath,
+    calibration: Path,
     among: str | None = None,
-    json: Json = False,
-    details: Details = False,
-    anyway: Anyway = False,
+    json: bool = False,
+    details: bool = False,
+    anyway: bool = False,
 ) -> None:
     """Plan mechanical adjustments of feet, shims and threads.
 

@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 
 import orthocal
 from orthocal.cli.options import (
-    Anyway,
-    CalibrationPath,
-    Force,
     OutDirectory,
     command,
     read_number,
@@ -38,13 +35,13 @@ FILES = ("session.yaml", "readings.csv", "sheet.html")
 
 @command()
 def again(
-    calibration: CalibrationPath,
+    calibration: Path,
     out: OutDirectory,
     session: Path | None = None,
     adjusted: str | None = None,
     ini: Path | None = None,
-    anyway: Anyway = False,
-    force: Force = False,
+    anyway: bool = False,
+    force: bool = False,
 ) -> None:
     """Plan the same readings again, with the values to enter.
 

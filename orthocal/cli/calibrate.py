@@ -11,16 +11,6 @@ from typer import Option
 import orthocal
 from orthocal.cli.files import load_joined
 from orthocal.cli.options import (
-    AllRows,
-    Details,
-    Effects,
-    Force,
-    Free,
-    Json,
-    Model,
-    OptionalOutDirectory,
-    SessionPaths,
-    Tolerances,
     command,
     read_tolerances,
     split_effects,
@@ -45,11 +35,11 @@ class ChoiceOptions:
         base: For research: estimate one of several redundant errors, without tolerances.
     """
 
-    model: Model = None
-    free: Free = None
-    effects: Effects = None
+    model: str | None = None
+    free: list[str] | None = None
+    effects: str | None = None
     known: list[str] | None = None
-    tolerance: Tolerances = None
+    tolerance: list[str] | None = None
     prior: Annotated[bool | None, Option("--prior/--no-prior")] = None
     bound: list[str] | None = None
     base: bool = False
@@ -80,17 +70,17 @@ class ChoiceOptions:
 
 @command()
 def calibrate(
-    sessions: SessionPaths,
+    sessions: list[Path],
     *,
     choice: ChoiceOptions,
     loss: str = "squares",
     solver: str = "ipopt",
     profile: list[str] | None = None,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    details: Details = False,
-    all_rows: AllRows = False,
-    force: Force = False,
+    out: Path | None = None,
+    json: bool = False,
+    details: bool = False,
+    all_: bool = False,
+    force: bool = False,
 ) -> None:
     """Identify the errors of a machine and the offsets to enter.
 
@@ -124,7 +114,7 @@ def calibrate(
             profile=split_globs(profile),
             judgement=judgement,
         )
-    shown = {"details": details, "all_rows": all_rows, "saved": out}
+    shown = {"details": details, "all_rows": all_, "saved": out}
     deliver_judged(result, json=json, out=out, files=lambda: _build_files(result, out), **shown)
 
 

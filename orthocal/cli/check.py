@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import orthocal
 from orthocal.cli.files import load_joined
 from orthocal.cli.options import (
-    Details,
-    Effects,
-    Json,
-    SessionPaths,
-    Tolerances,
     command,
     split_effects,
 )
@@ -18,11 +15,11 @@ from orthocal.cli.printing import deliver_judged
 
 @command()
 def check(
-    sessions: SessionPaths,
-    effects: Effects = None,
-    tolerance: Tolerances = None,
-    json: Json = False,
-    details: Details = False,
+    sessions: list[Path],
+    effects: str | None = None,
+    tolerance: list[str] | None = None,
+    json: bool = False,
+    details: bool = False,
 ) -> None:
     """Check readings for mistakes: signs, units, lines, the gauge.
 

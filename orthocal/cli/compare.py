@@ -7,12 +7,6 @@ from pathlib import Path
 import orthocal
 from orthocal.cli.files import load_each_once
 from orthocal.cli.options import (
-    AllRows,
-    Details,
-    Effects,
-    Json,
-    SessionPaths,
-    Tolerances,
     command,
     split_effects,
     split_globs,
@@ -22,14 +16,14 @@ from orthocal.cli.printing import deliver_judged, judgement_on_failure, put_note
 
 @command()
 def compare(
-    sessions: SessionPaths,
+    sessions: list[Path],
     models: str | None = None,
     repeat: list[Path] | None = None,
-    effects: Effects = None,
-    tolerance: Tolerances = None,
-    json: Json = False,
-    details: Details = False,
-    all_rows: AllRows = False,
+    effects: str | None = None,
+    tolerance: list[str] | None = None,
+    json: bool = False,
+    details: bool = False,
+    all_: bool = False,
 ) -> None:
     """Compare models, and recommend the one that readings support.
 
@@ -51,4 +45,4 @@ def compare(
             repeat=others,
             report=lambda text: put_note(f"orthocal: {text}"),
         )
-    deliver_judged(comparison, json=json, details=details, all_rows=all_rows)
+    deliver_judged(comparison, json=json, details=details, all_rows=all_)

@@ -22,12 +22,6 @@ from typer import Option
 
 import orthocal
 from orthocal.cli.options import (
-    Anyway,
-    CalibrationPath,
-    Force,
-    Payload,
-    Temperature,
-    ToolTip,
     command,
     read_vector,
 )
@@ -94,6 +88,8 @@ class CorrectionOptions:
         work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
         start_mm (X,Y,Z): Position that the controller displays before the program. Without it,
             rapid motions before the first position in X, Y and Z are not corrected.
+        temperature (C): Temperature of the machine, °C; default: the robot's reference temperature
+            (20 °C).
     """
 
     within: Annotated[float, Option(min=0.01, max=1000.0)] = 1.0
@@ -101,20 +97,20 @@ class CorrectionOptions:
     backlash: Backlash | None = None
     work_offset_mm: list[str] | None = None
     start_mm: str | None = None
-    tool: ToolTip = None
-    temperature: Temperature = None
-    payload: Payload = None
+    tool: str | None = None
+    temperature: float | None = None
+    payload: float | None = None
 
 
 @command()
 def correct(
-    calibration: CalibrationPath,
+    calibration: Path,
     program: Path,
     *,
     options: CorrectionOptions,
     out: Path | None = None,
-    anyway: Anyway = False,
-    force: Force = False,
+    anyway: bool = False,
+    force: bool = False,
 ) -> None:
     """Correct a G-code program for the errors of the machine.
 

@@ -10,13 +10,7 @@ from typer import Option
 
 import orthocal
 from orthocal.cli.options import (
-    Anyway,
-    CalibrationPath,
-    Force,
-    HalfSideMm,
     OutDirectory,
-    Payload,
-    ToolTip,
     command,
     read_numbers,
     read_vector,
@@ -38,19 +32,19 @@ ALTERNATIVES = ("joints.ini", "kinematics.ini")
 
 @command()
 def export(
-    calibration: CalibrationPath,
+    calibration: Path,
     to: Annotated[str, Option()],
     out: OutDirectory,
     module: Annotated[bool | None, Option("--module/--offsets")] = None,
     within: float | None = None,
-    half_side_mm: HalfSideMm = None,
-    tool: ToolTip = None,
-    payload: Payload = None,
+    half_side_mm: float | None = None,
+    tool: str | None = None,
+    payload: float | None = None,
     home_offset: str | None = None,
     latched: str | None = None,
     ini: Path | None = None,
-    anyway: Anyway = False,
-    force: Force = False,
+    anyway: bool = False,
+    force: bool = False,
 ) -> None:
     """Write a calibration for a controller or another program.
 

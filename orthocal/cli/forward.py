@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orthocal
-from orthocal.cli.options import CalibrationPath, UseOptions, command
+from orthocal.cli.options import UseOptions, command
 from orthocal.cli.printing import print_rows, put_note
 from orthocal.errors import SessionError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @command()
-def forward(calibration: CalibrationPath, joints: Path, *, use: UseOptions) -> None:
+def forward(calibration: Path, joints: Path, *, use: UseOptions) -> None:
     """Print tool positions for drive coordinates, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can

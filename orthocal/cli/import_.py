@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-from typer import Option
 
 import orthocal
-from orthocal.cli.options import Json, command, read_pairs
+from orthocal.cli.options import command, read_pairs
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.io.files import exists
@@ -35,10 +32,10 @@ def import_(
     fill: bool = False,
     replace: bool = False,
     dry_run: bool = False,
-    format: Annotated[str | None, Option("--format")] = None,
+    format: str | None = None,
     settings: list[Path] | None = None,
     radius_mm: float | None = None,
-    json: Json = False,
+    json: bool = False,
 ) -> None:
     """Import readings from a spreadsheet, or the log of a printer.
 

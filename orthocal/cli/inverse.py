@@ -7,11 +7,11 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.forward import print_transformed
-from orthocal.cli.options import CalibrationPath, UseOptions, command
+from orthocal.cli.options import UseOptions, command
 
 
 @command()
-def inverse(calibration: CalibrationPath, targets: Path, *, use: UseOptions) -> None:
+def inverse(calibration: Path, targets: Path, *, use: UseOptions) -> None:
     """Print drive coordinates for tool positions, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can

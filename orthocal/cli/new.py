@@ -13,14 +13,6 @@ import typer
 import orthocal
 from orthocal.cli.options import (
     ControllerOptions,
-    Force,
-    Gauge,
-    Hours,
-    Model,
-    Owned,
-    TemperatureRange,
-    Tolerances,
-    WorkspaceMm,
     command,
     read_pairs,
     read_temperatures,
@@ -157,16 +149,16 @@ class FirstPlanOptions:
             no search.
     """
 
-    workspace_mm: WorkspaceMm = None
+    workspace_mm: str | None = None
     paper: bool = False
-    hours: Hours = None
-    gauge: Gauge = None
-    with_: Owned = None
-    model: Model = None
+    hours: float | None = None
+    gauge: Path | None = None
+    with_: list[Path] | None = None
+    model: str | None = None
     effects: str = EFFECTS
     screw_lead_mm: float | None = None
-    temperature: TemperatureRange = None
-    tolerance: Tolerances = None
+    temperature: str | None = None
+    tolerance: list[str] | None = None
 
     def changed(self) -> dict[str, object]:
         """Values that differ from their defaults, by option."""
@@ -194,7 +186,7 @@ def new(
     options: FirstPlanOptions,
     controller: ControllerOptions,
     again: bool = False,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Make a machine of your dimensions, a first plan and its sheet.
 

@@ -112,9 +112,10 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
     """Decorator of commands, whose arguments and options are described in their docstrings.
 
     An entry under Args is `name (METAVAR): help`. A parameter without a default is an argument,
-    and every other parameter is an option. An `Option` in its annotation states limits and other
-    names. The fields of a parameter that is a dataclass are options, described in the docstring of
-    the dataclass in the same way.
+    and every other parameter is an option; `with_` is --with. An `Option` in its annotation states
+    limits and other names. The fields of a parameter that is a dataclass are options, described in
+    the docstring of the dataclass in the same way. `SharedOptions` describes those without an
+    entry.
 
     Args:
         group: Group of the command.
@@ -145,8 +146,7 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
 
 def _list_parameters(source: Callable[..., Any]) -> list[inspect.Parameter]:
     """Parameters of a command or fields of a record, annotated with their descriptions."""
-    entries = (inspect.getdoc(source) or "").partition("\n\nArgs:\n")[2]
-    described = {name: (metavar, words) for name, metavar, words in _ENTRY.findall(entries)}
+    described = _read_entries(SharedOptions) | _read_entries(source)
     hints: dict[str, Any] = get_type_hints(source, include_extras=True)
     parameters = []
     for parameter in inspect.signature(source).parameters.values():
@@ -160,6 +160,12 @@ def _list_parameters(source: Callable[..., Any]) -> list[inspect.Parameter]:
     return parameters
 
 
+def _read_entries(source: Callable[..., Any]) -> dict[str, tuple[str, str]]:
+    """Metavar and help of the parameters that a docstring describes, by name."""
+    entries = (inspect.getdoc(source) or "").partition("\n\nArgs:\n")[2]
+    return {name: (metavar, words) for name, metavar, words in _ENTRY.findall(entries)}
+
+
 def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str) -> Any:  # noqa: ANN401 - annotations
     """Annotation of a parameter with its metavar and help."""
     if hasattr(hint, "__metadata__"):
@@ -167,150 +173,61 @@ def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str)
         info = copy(info)
     elif parameter.default is inspect.Parameter.empty:
         kind, info = hint, Argument()
-    else:  # a flag has no negative form
-        flag = [f"--{parameter.name.replace('_', '-')}"] if parameter.default is False else []
-        kind, info = hint, Option(*flag)
+    else:  # a stated name: a flag has no negative form
+        kind, info = hint, Option(f"--{parameter.name.strip('_').replace('_', '-')}")
     info.metavar, info.help = metavar or None, " ".join(words.split())
     return Annotated[kind, info]
 
 
-SessionPath = Annotated[
-    Path, Argument(metavar="SESSION", help="session.yaml, or the directory that contains it.")
-]
-SessionPaths = Annotated[
-    list[Path],
-    Argument(
-        metavar="SESSION...",
-        help="session.yaml, or the directory that contains it; several are calibrated together.",
-    ),
-]
-PlanPath = Annotated[
-    Path, Argument(metavar="PLAN", help="session.yaml of a plan or a session, or its directory.")
-]
-CalibrationPath = Annotated[
-    Path,
-    Argument(metavar="CALIBRATION", help="calibration.json, or the directory that contains it."),
-]
-Model = Annotated[
-    str | None,
-    Option(
-        metavar="MODEL",
-        help="Errors to identify: full (the complete machine), offsets, lengths or another "
-        "model of the robot; default: that of the session, else full.",
-    ),
-]
-Free = Annotated[
-    list[str] | None,
-    Option(
-        metavar="PATTERNS",
-        help="Errors to identify, by name or pattern; * stands for any text. With --model they "
-        "are additional; '!' excludes: --model full --free '!*_fork.*'.",
-    ),
-]
-Tolerances = Annotated[
-    list[str] | None,
-    Option(
-        metavar="PATTERN=VALUE",
-        help="Tolerance (± limit) instead of the robot's, such as '*.offset_mm=4'; * stands for "
-        "any text.",
-    ),
-]
-Effects = Annotated[
-    str | None,
-    Option(
-        metavar="EFFECTS",
-        help="Effects to identify, such as backlash,thermal, or none; default: those that the "
-        "session states, else those of the robot.",
-    ),
-]
-TemperatureRange = Annotated[
-    str | None,
-    Option(
-        "--temperature",
-        metavar="FIRST:LAST",
-        help="Temperature at the first and at the last reading, °C, such as 20:28.",
-    ),
-]
-Error = Annotated[
-    list[str] | None,
-    Option(metavar="NAME=VALUE", help="Error of the machine, such as x_slide.offset_mm=1.2."),
-]
-Errors = Annotated[
-    Path | None,
-    Option(metavar="FILE", help="YAML file with errors of the machine, such as a truth.yaml."),
-]
-Gauge = Annotated[
-    Path | None,
-    Option(
-        metavar="FILE",
-        help="dial.yaml with range, resolution and tip of the gauge; default tip: ball of 3 mm "
-        "diameter; default gauge: ±5 mm, 10 µm, this ball.",
-    ),
-]
-Owned = Annotated[
-    list[Path] | None,
-    Option(
-        "--with",
-        metavar="FILE",
-        help="A sensor at the tool that you have, such as a ball bar or a square; repeatable.",
-    ),
-]
-Hours = Annotated[
-    float | None,
-    Option(metavar="HOURS", help="Time available for measuring; default: what 6 setups take."),
-]
-WorkspaceMm = Annotated[
-    str | None,
-    Option(
-        "--workspace-mm",
-        metavar="HALF|LOW:HIGH,...",
-        help="Workspace around the mechanical zero, mm: half the side of a cube, or a range "
-        "for each coordinate; default: that of the robot, else the largest cube that the machine "
-        "reaches, at most ±60 mm.",
-    ),
-]
-HalfSideMm = Annotated[
-    float | None,
-    Option(
-        "--half-side-mm",
-        metavar="MM",
-        help="Half the side of a cube around the mechanical zero; default: the workspace.",
-    ),
-]
-ToolTip = Annotated[
-    str | None,
-    Option(
-        "--tool",
-        metavar="X,Y,Z",
-        help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
-    ),
-]
-Temperature = Annotated[
-    float | None,
-    Option(
-        metavar="C",
-        help="Temperature of the machine, °C; default: the robot's reference temperature (20 °C).",
-    ),
-]
-Payload = Annotated[float | None, Option(metavar="KG", help="Mass on the tool, kg; default: none.")]
+OutDirectory = Annotated[Path, Option()]
 Positive = Annotated[int | None, Option(min=1)]
-Seed = Annotated[int, Option(min=0, metavar="N", help="Seed of the random numbers.")]
-Workers = Annotated[
-    int | None,
-    Option(min=1, max=1024, metavar="N", help="Number of processes; default: all cores."),
-]
-_OUT = Option("--out", metavar="DIRECTORY", help="Directory for the results; created if necessary.")
-OutDirectory = Annotated[Path, _OUT]
-OptionalOutDirectory = Annotated[Path | None, _OUT]
-Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
-Details = Annotated[
-    bool, Option("--details", help="Print the complete result, not the short answer.")
-]
-AllRows = Annotated[bool, Option("--all", help="List every reading, parameter and group.")]
-Force = Annotated[bool, Option("--force", help="Overwrite existing files.")]
-Anyway = Annotated[
-    bool, Option("--anyway", help="Continue against the verdict of the calibration.")
-]
+Seed = Annotated[int, Option(min=0)]
+Workers = Annotated[int | None, Option(min=1, max=1024)]
+
+
+class SharedOptions:
+    """Arguments and options that several commands share.
+
+    Args:
+        sessions (SESSION...): session.yaml, or the directory that contains it; several are
+            calibrated together.
+        plan (PLAN): session.yaml of a plan or a session, or its directory.
+        calibration (CALIBRATION): calibration.json, or the directory that contains it.
+        model (MODEL): Errors to identify: full (the complete machine), offsets, lengths or another
+            model of the robot; default: that of the session, else full.
+        free (PATTERNS): Errors to identify, by name or pattern; * stands for any text. With --model
+            they are additional; '!' excludes: --model full --free '!*_fork.*'.
+        tolerance (PATTERN=VALUE): Tolerance (± limit) instead of the robot's, such as
+            '*.offset_mm=4'; * stands for any text.
+        effects (EFFECTS): Effects to identify, such as backlash,thermal, or none; default: those
+            that the session states, else those of the robot.
+        temperature (FIRST:LAST): Temperature at the first and at the last reading, °C, such as
+            20:28.
+        error (NAME=VALUE): Error of the machine, such as x_slide.offset_mm=1.2.
+        errors (FILE): YAML file with errors of the machine, such as a truth.yaml.
+        gauge (FILE): dial.yaml with range, resolution and tip of the gauge; default tip: ball of
+            3 mm diameter; default gauge: ±5 mm, 10 µm, this ball.
+        with_ (FILE): A sensor at the tool that you have, such as a ball bar or a square;
+            repeatable.
+        hours (HOURS): Time available for measuring; default: what 6 setups take.
+        workspace_mm (HALF|LOW:HIGH,...): Workspace around the mechanical zero, mm: half the side of
+            a cube, or a range for each coordinate; default: that of the robot, else the largest
+            cube that the machine reaches, at most ±60 mm.
+        half_side_mm (MM): Half the side of a cube around the mechanical zero; default: the
+            workspace.
+        tool (X,Y,Z): Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.
+        payload (KG): Mass on the tool, kg; default: none.
+        seed (N): Seed of the random numbers.
+        workers (N): Number of processes; default: all cores.
+        leg_mm (MM): Leg length of an Orthoglide of other dimensions.
+        dask (ADDRESS): Run on a Dask cluster; address of its scheduler.
+        out (DIRECTORY): Directory for the results; created if necessary.
+        json: Print the result as JSON.
+        details: Print the complete result, not the short answer.
+        all_: List every reading, parameter and group.
+        force: Overwrite existing files.
+        anyway: Continue against the verdict of the calibration.
+    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -362,14 +279,16 @@ class UseOptions:
     """Options about the conditions of use.
 
     Args:
+        temperature (C): Temperature of the machine, °C; default: the robot's reference temperature
+            (20 °C).
         approach (LETTERS): Sides from which the drives come, a letter for each: p if its coordinate
             grew in the last motion, n if it fell, u if unknown, such as pnp; default: the middle of
             both sides.
     """
 
     approach: str | None = None
-    temperature: Temperature = None
-    payload: Payload = None
+    temperature: float | None = None
+    payload: float | None = None
 
     def read(self, robot: orthocal.Robot) -> orthocal.UseConditions:
         """Conditions of use.

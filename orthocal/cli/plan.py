@@ -11,21 +11,9 @@ from typer import Option
 import orthocal
 from orthocal.cli.options import (
     ControllerOptions,
-    Details,
-    Effects,
-    Force,
-    Gauge,
-    Hours,
-    Json,
-    Model,
-    OptionalOutDirectory,
-    Owned,
     Positive,
     Seed,
-    TemperatureRange,
-    Tolerances,
     Workers,
-    WorkspaceMm,
     command,
     load_robot_or_session,
     read_box,
@@ -72,13 +60,13 @@ class PlanOptions:
             number of candidate readings, at least 3 and at most 30.
     """
 
-    model: Model = None
+    model: str | None = None
     setups: Positive = None
     readings: Annotated[int | None, Option(min=2)] = None
-    hours: Hours = None
+    hours: float | None = None
     add: Positive = None
-    gauge: Gauge = None
-    with_: Owned = None
+    gauge: Path | None = None
+    with_: list[Path] | None = None
     touches: str | None = None
     sections: str | None = None
     box: str | None = None
@@ -86,11 +74,11 @@ class PlanOptions:
     across_mm: float = 20.0
     minutes_per_setup: float = 10.0
     minutes_per_reading: float = 0.5
-    workspace_mm: WorkspaceMm = None
+    workspace_mm: str | None = None
     criterion: str = "aligned"
-    effects: Effects = None
-    temperature: TemperatureRange = None
-    tolerance: Tolerances = None
+    effects: str | None = None
+    temperature: str | None = None
+    tolerance: list[str] | None = None
     starts: Annotated[int | None, Option(min=1, max=100)] = None
     seed: Seed = 0
     workers: Workers = None
@@ -102,10 +90,10 @@ def plan(
     *,
     options: PlanOptions,
     controller: ControllerOptions,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    details: Details = False,
-    force: Force = False,
+    out: Path | None = None,
+    json: bool = False,
+    details: bool = False,
+    force: bool = False,
 ) -> None:
     """Choose setups and postures for the smallest tool error.
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import CalibrationPath, Force, command
+from orthocal.cli.options import command
 from orthocal.cli.overwriting import require_replaceable_file
 from orthocal.cli.printing import put_note
 from orthocal.io.files import is_folder
 
 
 @command()
-def report(calibration: CalibrationPath, out: Path | None = None, force: Force = False) -> None:
+def report(calibration: Path, out: Path | None = None, force: bool = False) -> None:
     """Write the report of a calibration as a page.
 
     Args:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command
+from orthocal.cli.options import command
 from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError, SessionError
@@ -17,14 +17,14 @@ from orthocal.text import quote_path
 
 @command()
 def sheet(
-    session: PlanPath,
+    plan: Path,
     feed: float = 600.0,
     approach_feed: float = 120.0,
     dwell: float | None = None,
     trigger: str | None = None,
     ini: Path | None = None,
-    out: OptionalOutDirectory = None,
-    force: Force = False,
+    out: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Write a measuring sheet and a G-code program for each setup.
 
@@ -46,20 +46,20 @@ def sheet(
     from orthocal.output.text.layout import counted
 
     options = ProgramOptions(feed, approach_feed, dwell, trigger)
-    directory = out or (session if is_folder(session) else session.parent)
+    directory = out or (plan if is_folder(plan) else plan.parent)
     require_writable(directory)
-    plan = orthocal.load_plan(session)
-    following = following_command(plan, session, directory)
-    files = sheet_files(plan, options=options, following=following)
+    session = orthocal.load_plan(plan)
+    following = following_command(session, plan, directory)
+    files = sheet_files(session, options=options, following=following)
     require_replaceable_results(directory, files, force=force)
     write_files(directory, files)
     count = len(files) - 1
     programs = "; no programs: the drives control no tool"
     if count:
-        noun = "program" if plan.firmware is None else "file"
+        noun = "program" if session.firmware is None else "file"
         programs = f" and {counted(count, noun)}{' of lines to send' * (noun == 'file')}"
     put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
-    note_contradictions(plan, ini)
+    note_contradictions(session, ini)
 
 
 def following_command(plan: orthocal.Session, path: Path, directory: Path) -> str:

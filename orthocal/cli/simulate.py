@@ -8,14 +8,8 @@ from pathlib import Path
 import orthocal
 from orthocal.cli.files import load_stated_plan
 from orthocal.cli.options import (
-    Error,
-    Errors,
-    Force,
     OutDirectory,
-    PlanPath,
     Seed,
-    TemperatureRange,
-    Tolerances,
     command,
     state_tolerances,
 )
@@ -28,17 +22,17 @@ FILES = ("session.yaml", "readings.csv", "truth.yaml")
 
 @command()
 def simulate(
-    plan: PlanPath,
+    plan: Path,
     out: OutDirectory,
-    error: Error = None,
-    errors: Errors = None,
+    error: list[str] | None = None,
+    errors: Path | None = None,
     draw: str | None = None,
     effects: str | None = None,
-    temperature: TemperatureRange = None,
-    tolerance: Tolerances = None,
+    temperature: str | None = None,
+    tolerance: list[str] | None = None,
     exact: bool = False,
     seed: Seed = 0,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Simulate the readings of a machine with known errors.
 

@@ -16,20 +16,7 @@ import orthocal
 from orthocal.cli.files import load_stated_plan
 from orthocal.cli.options import (
     LARGEST_MM,
-    AllRows,
-    Error,
-    Errors,
-    Force,
-    Free,
-    HalfSideMm,
-    Json,
-    Model,
-    OptionalOutDirectory,
-    PlanPath,
     Seed,
-    SessionPath,
-    TemperatureRange,
-    Tolerances,
     Workers,
     app,
     command,
@@ -63,18 +50,12 @@ PROGRESS_STEP = 0.1
 
 Count = Annotated[int, Option(min=2, max=1_000_000)]
 Size = Annotated[int, Option(min=1, max=10_000)]
-Dask = Annotated[
-    str | None, Option(metavar="ADDRESS", help="Run on a Dask cluster; address of its scheduler.")
-]
 Subject = Annotated[
     str,
     Argument(
         metavar="ROBOT|SESSION",
         help="An Orthoglide-type robot, measured by the paper's plan; or a session.",
     ),
-]
-LegMm = Annotated[
-    float | None, Option(metavar="MM", help="Leg length of an Orthoglide of other dimensions.")
 ]
 
 
@@ -83,28 +64,28 @@ class RunOptions:
     """Options about the run of a study and its results."""
 
     workers: Workers = None
-    dask: Dask = None
-    out: OptionalOutDirectory = None
-    json: Json = False
-    all_rows: AllRows = False
-    force: Force = False
+    dask: str | None = None
+    out: Path | None = None
+    json: bool = False
+    all_: bool = False
+    force: bool = False
 
 
 @command(studies)
 def accuracy(
-    plan: PlanPath,
+    plan: Path,
     *,
-    model: Model = None,
-    free: Free = None,
+    model: str | None = None,
+    free: list[str] | None = None,
     machines: Count = 1000,
     draw: list[str] | None = None,
-    error: Error = None,
-    errors: Errors = None,
+    error: list[str] | None = None,
+    errors: Path | None = None,
     effects: str | None = None,
     ignore: str | None = None,
-    temperature: TemperatureRange = None,
-    tolerance: Tolerances = None,
-    half_side_mm: HalfSideMm = None,
+    temperature: str | None = None,
+    tolerance: list[str] | None = None,
+    half_side_mm: float | None = None,
     seed: Seed = 0,
     run: RunOptions,
 ) -> None:
@@ -176,15 +157,15 @@ def linearisation(
     along: str | None = None,
     max_mm: float | None = None,
     min_mm: float | None = None,
-    leg_mm: LegMm = None,
+    leg_mm: float | None = None,
     sigma_mm: float | None = None,
     resolution_mm: float | None = None,
     seed: Seed = 0,
     workers: Workers = None,
-    dask: Dask = None,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    force: Force = False,
+    dask: str | None = None,
+    out: Path | None = None,
+    json: bool = False,
+    force: bool = False,
 ) -> None:
     """Compare linearised with exact identification as errors grow.
 
@@ -258,11 +239,11 @@ def sensitivity(
     subject: Subject = "orthoglide",
     free: list[str] | None = None,
     at: list[str] | None = None,
-    leg_mm: LegMm = None,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    all_rows: AllRows = False,
-    force: Force = False,
+    leg_mm: float | None = None,
+    out: Path | None = None,
+    json: bool = False,
+    all_: bool = False,
+    force: bool = False,
 ) -> None:
     """Print how each error changes readings and tool position.
 
@@ -283,24 +264,25 @@ def sensitivity(
         study = orthocal.build_sensitivity_study(
             session or robot, _parameter_globs(free, robot), points=points or None
         )
-    _run(study, RunOptions(workers=1, out=out, json=json, all_rows=all_rows, force=force))
+    _run(study, RunOptions(workers=1, out=out, json=json, all_=all_, force=force))
 
 
 @command(studies)
 def bootstrap(
-    session: SessionPath,
+    session: Path,
     *,
-    model: Model = None,
-    free: Free = None,
+    model: str | None = None,
+    free: list[str] | None = None,
     by: str = "residuals",
     draws: Count = 1000,
-    tolerance: Tolerances = None,
+    tolerance: list[str] | None = None,
     seed: Seed = 0,
     run: RunOptions,
 ) -> None:
     """Estimate the scatter of errors by resampling a session.
 
     Args:
+        session (SESSION): session.yaml, or the directory that contains it.
         by (residuals|cycles): Resample residuals or cycles of setups.
         draws (N): Number of draws.
     """
@@ -351,7 +333,7 @@ def _run(study: orthocal.Study, options: RunOptions) -> None:
             report=_progress_lines(study),
         )
     with worker_budget(1 if dask is not None else count):
-        report = report_study(table, all_rows=options.all_rows)
+        report = report_study(table, all_rows=options.all_)
         document = study_json(table, report)
         deliver(
             lambda: document,

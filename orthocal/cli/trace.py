@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from typer import Argument
+from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import Force, OutDirectory, PlanPath, command, read_pairs
+from orthocal.cli.options import OutDirectory, command, read_pairs
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
 
 FILES = ("session.yaml", "readings.csv")
 
-Traces = Annotated[
-    list[str],
-    Argument(metavar="SETUP=FILE ...", help="Setup and the CSV file of its trace."),
-]
-
 
 @command()
-def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = False) -> None:
+def trace(plan: Path, traces: list[str], out: OutDirectory, force: bool = False) -> None:
     """Average traces of a gauge into readings of a session.
 
     A trace is read while the tool moves along a path. It is a CSV file with the columns x_mm,
     y_mm, z_mm (commanded position of the tool) and reading_mm, with thousands of lines. The
     directory receives session.yaml with a posture for each average, and readings.csv.
+
+    Args:
+        traces (SETUP=FILE ...): Setup and the CSV file of its trace.
     """
     from orthocal.assessment.wording import counted
     from orthocal.measurement.files.session_file import load_plan
@@ -38,11 +34,11 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     from orthocal.session.points import count_readings
 
     require_new_session(out, FILES, force=force)
-    plan = load_plan(session)
+    session = load_plan(plan)
     files = read_pairs(traces, "traces", "SETUP=FILE")
-    by_setup = {name: read_trace(path, plan.robot) for name, path in files.items()}
-    binned = bin_traces(plan, by_setup)
-    averaged = with_traces(plan, binned)
+    by_setup = {name: read_trace(path, session.robot) for name, path in files.items()}
+    binned = bin_traces(session, by_setup)
+    averaged = with_traces(session, binned)
     path = orthocal.write_session(averaged, out)
     samples = sum(len(t.values) for t in by_setup.values())
     put_note(

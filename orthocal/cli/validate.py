@@ -7,11 +7,6 @@ from pathlib import Path
 import orthocal
 from orthocal.cli.files import load_each_once, require_not_calibrated
 from orthocal.cli.options import (
-    AllRows,
-    CalibrationPath,
-    Details,
-    Json,
-    Tolerances,
     command,
     read_tolerances,
 )
@@ -22,12 +17,12 @@ from orthocal.text import quote_path
 
 @command()
 def validate(
-    calibration: CalibrationPath,
+    calibration: Path,
     sessions: list[Path],
-    tolerance: Tolerances = None,
-    json: Json = False,
-    details: Details = False,
-    all_rows: AllRows = False,
+    tolerance: list[str] | None = None,
+    json: bool = False,
+    details: bool = False,
+    all_: bool = False,
 ) -> None:
     """Compare new readings with the predictions of a calibration.
 
@@ -44,7 +39,7 @@ def validate(
     tolerances = read_tolerances(tolerance, before.robot)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json, details=details):
         validation = orthocal.validate_calibration(before, loaded, tolerances=tolerances)
-    deliver_judged(validation, json=json, details=details, all_rows=all_rows)
+    deliver_judged(validation, json=json, details=details, all_rows=all_)
 
 
 def _require_order(calibration: Path, sessions: list[Path]) -> None:

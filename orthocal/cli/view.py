@@ -23,7 +23,7 @@ def view(
     png: Path | None = None,
     size: str = "1400x900",
     port: Annotated[int | None, Option(min=1, max=65535)] = None,
-    browse: Annotated[bool, Option("--open")] = False,
+    open_: bool = False,
 ) -> None:
     """Show a machine, a session or a calibration in 3-D.
 
@@ -39,7 +39,7 @@ def view(
         png (FILE): Write a picture; needs an installed Chromium.
         size (WIDTHxHEIGHT): Size of the picture, in pixels.
         port (N): Port to listen on; default: a free one.
-        browse: Open the page in a browser.
+        open_: Open the page in a browser.
     """
     from orthocal.output.text.subject import load_subject
     from orthocal.viewer.browser import find_chromium, parse_size, take_picture
@@ -58,10 +58,10 @@ def view(
     if png is not None:
         put_note(f"Wrote {take_picture(scene.to_html(), png, width=width, height=height)}")
     if html is None and png is None:
-        _serve(scene, port, browse)
+        _serve(scene, port, browse=open_)
 
 
-def _serve(scene: orthocal.Scene, port: int | None, browse: bool) -> None:
+def _serve(scene: orthocal.Scene, port: int | None, *, browse: bool) -> None:
     """Serve a scene until Ctrl-C."""
     with orthocal.LiveScene(scene, port=port) as live:
         put_out(live.url)
