@@ -11,11 +11,7 @@ from typer import Argument, Exit
 
 import orthocal
 from orthocal.cli.forward import put_assumed
-from orthocal.cli.options import (
-    UseOptions,
-    command,
-    require_between,
-)
+from orthocal.cli.options import UseOptions, command, require_between
 from orthocal.cli.printing import deliver, print_rows, put_note
 from orthocal.errors import ClosureError, ParameterError, SessionError
 from orthocal.text import quote_path

@@ -104,11 +104,7 @@ def _state_joints(
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.effects.compensation import with_homes
-    from orthocal.export.linuxcnc.entered_lines import (
-        expected_homes,
-        states_homes,
-        states_offsets,
-    )
+    from orthocal.export.linuxcnc.entered_lines import expected_homes, states_homes, states_offsets
 
     if joints is None:
         trims = compensation_to_enter(calibration) or calibration.session.compensation

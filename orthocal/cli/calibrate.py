@@ -10,12 +10,7 @@ from typer import Option
 
 import orthocal
 from orthocal.cli.files import load_joined
-from orthocal.cli.options import (
-    command,
-    read_tolerances,
-    split_effects,
-    split_globs,
-)
+from orthocal.cli.options import command, read_tolerances, split_effects, split_globs
 from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
 

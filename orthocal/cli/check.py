@@ -6,10 +6,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import load_joined
-from orthocal.cli.options import (
-    command,
-    split_effects,
-)
+from orthocal.cli.options import command, split_effects
 from orthocal.cli.printing import deliver_judged
 
 

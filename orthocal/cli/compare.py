@@ -6,11 +6,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import load_each_once
-from orthocal.cli.options import (
-    command,
-    split_effects,
-    split_globs,
-)
+from orthocal.cli.options import command, split_effects, split_globs
 from orthocal.cli.printing import deliver_judged, judgement_on_failure, put_note
 
 

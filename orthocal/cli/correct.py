@@ -21,10 +21,7 @@ from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, NamedTuple
 from typer import Option
 
 import orthocal
-from orthocal.cli.options import (
-    command,
-    read_vector,
-)
+from orthocal.cli.options import command, read_vector
 from orthocal.cli.overwriting import require_replaceable_file
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import CalibrationFileError, GcodeError, OutputError, ParameterError

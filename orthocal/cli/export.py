@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 import orthocal
-from orthocal.cli.options import (
-    OutDirectory,
-    command,
-    read_numbers,
-    read_vector,
-)
+from orthocal.cli.options import OutDirectory, command, read_numbers, read_vector
 from orthocal.cli.overwriting import mark_written, require_replaceable_results, require_same_text
 from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError

@@ -483,9 +483,9 @@ def _draw(
 
 def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
+    from orthocal.assessment.wording import counted
     from orthocal.output.text.accuracy import describe_gains
     from orthocal.output.text.answer import calibrate_command
-    from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import (
         describe_absent,
         describe_expected,

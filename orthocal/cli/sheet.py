@@ -41,9 +41,9 @@ def sheet(
         ini (FILE): INI file of LinuxCNC; motions beyond its soft limits and other HOME_OFFSET than
             in session.yaml are named.
     """
+    from orthocal.assessment.wording import counted
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
-    from orthocal.output.text.layout import counted
 
     options = ProgramOptions(feed, approach_feed, dwell, trigger)
     directory = out or (plan if is_folder(plan) else plan.parent)

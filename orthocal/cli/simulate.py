@@ -7,12 +7,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import load_stated_plan
-from orthocal.cli.options import (
-    OutDirectory,
-    Seed,
-    command,
-    state_tolerances,
-)
+from orthocal.cli.options import OutDirectory, Seed, command, state_tolerances
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
 from orthocal.text import quote_path

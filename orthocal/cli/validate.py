@@ -6,10 +6,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import load_each_once, require_not_calibrated
-from orthocal.cli.options import (
-    command,
-    read_tolerances,
-)
+from orthocal.cli.options import command, read_tolerances
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
 from orthocal.io.files import exists
 from orthocal.text import quote_path

@@ -14,6 +14,7 @@ from rich.console import Group
 
 from orthocal.assessment.circular_deviation import find_circles
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
+from orthocal.assessment.wording import mm, plain, signed
 from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.calibration.records import SessionRecord
 from orthocal.errors import ClosureError, OrthocalError, RobotError
@@ -43,7 +44,7 @@ from orthocal.output.text.answer import (
     render_subject,
     render_values,
 )
-from orthocal.output.text.layout import mm, plain, signed, to_markup
+from orthocal.output.text.layout import to_markup
 from orthocal.output.text.tables import (
     render_findings,
     render_fit,

@@ -17,6 +17,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.wording import counted
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
@@ -29,7 +30,7 @@ from orthocal.output.scene.deviations import (
 )
 from orthocal.output.scene.readings import draw_readings, write_headline, write_steps
 from orthocal.output.scene.tool_errors import draw_tool_errors
-from orthocal.output.text.layout import counted, typeset
+from orthocal.output.text.layout import typeset
 from orthocal.robot.model import Robot, coordinate_units, name_coordinates
 from orthocal.robot.reference_posture import count_free_motions
 from orthocal.session.session import Session

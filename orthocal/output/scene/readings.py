@@ -8,15 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.assessment.wording import counted
 from orthocal.kinematics.robot_functions import reference_poses
-from orthocal.output.scene.deviations import (
-    Deviation,
-    Measurement,
-    Place,
-    Stop,
-    worst_of_setups,
-)
-from orthocal.output.text.layout import counted, list_places, short_name, typeset
+from orthocal.output.scene.deviations import Deviation, Measurement, Place, Stop, worst_of_setups
+from orthocal.output.text.layout import list_places, short_name, typeset
 from orthocal.sensors.protocol import Contact, has_dial
 from orthocal.session.session import Setup
 from orthocal.units import MM

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from orthocal.arrays import Array
 from orthocal.assessment.assess import changes_offsets
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
+from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
-from orthocal.output.text.layout import um
 from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.scene import LegendEntry, Scene, round_scale
 from orthocal.viewer.shapes import Colour, css, draw_arrow, material, pose_along

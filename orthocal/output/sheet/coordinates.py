@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from orthocal.arrays import Array
-from orthocal.measurement.motion.guidance import (
-    shown_joints,
-)
+from orthocal.measurement.motion.guidance import shown_joints
 from orthocal.output.text.layout import true_minus
 from orthocal.robot.model import Robot, name_coordinates
 from orthocal.session.session import Session

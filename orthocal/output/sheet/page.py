@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from importlib import resources
 
+from orthocal.assessment.wording import counted
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.measurement.motion.approach import describe_approach
-from orthocal.measurement.motion.guidance import (
-    describe_mounting,
-    guide,
-    is_displaced,
-    shown_tool,
-)
+from orthocal.measurement.motion.guidance import describe_mounting, guide, is_displaced, shown_tool
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import (
     ProgramOptions,
@@ -21,15 +17,8 @@ from orthocal.measurement.motion.motion_program import (
 )
 from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.conditions import needed_conditions
-from orthocal.output.sheet.coordinates import (
-    joint_values,
-    show_length,
-    show_number,
-)
-from orthocal.output.sheet.gauge_position import (
-    GaugePosition,
-    find_gauge_position,
-)
+from orthocal.output.sheet.coordinates import joint_values, show_length, show_number
+from orthocal.output.sheet.gauge_position import GaugePosition, find_gauge_position
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.sheet.rules import (
     CHECKS_OF_PRINTER,
@@ -38,7 +27,6 @@ from orthocal.output.sheet.rules import (
     reading_rules,
 )
 from orthocal.output.sheet.steps import VISIBLE, compare_closing, list_steps, setup_warnings
-from orthocal.output.text.layout import counted
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
 from orthocal.session.points import one_row_per_point

@@ -16,12 +16,7 @@ from orthocal.observation.conditions import needed_conditions
 from orthocal.output.sheet.coordinates import joint_list, show_number
 from orthocal.output.text.layout import true_minus
 from orthocal.robot.model import PARALLEL_SINE, Robot, drive_keys, name_coordinates
-from orthocal.sensors.protocol import (
-    PROBING_DISTANCE,
-    has_dial,
-    probing_direction,
-    tool_path,
-)
+from orthocal.sensors.protocol import PROBING_DISTANCE, has_dial, probing_direction, tool_path
 from orthocal.session.session import Session
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, tidy
 

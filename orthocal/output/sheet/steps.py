@@ -6,27 +6,14 @@ import numpy as np
 
 from orthocal.assessment.wording import name_direction
 from orthocal.io.html import paragraph
-from orthocal.measurement.motion.guidance import (
-    dial_zero,
-    range_of_expected,
-    set_dial,
-    shown_tool,
-)
+from orthocal.measurement.motion.guidance import dial_zero, range_of_expected, set_dial, shown_tool
 from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.gauge_noise import usual_difference
 from orthocal.output.sheet.coordinates import show_length, show_number, shown_place
-from orthocal.output.sheet.gauge_position import (
-    ABOUT_ALONG,
-    GaugePosition,
-    name_tip,
-)
+from orthocal.output.sheet.gauge_position import ABOUT_ALONG, GaugePosition, name_tip
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import (
-    has_dial,
-    mounting_steps,
-    probing_direction,
-)
+from orthocal.sensors.protocol import has_dial, mounting_steps, probing_direction
 from orthocal.session.session import Session, Setup
 from orthocal.units import MM
 

@@ -20,7 +20,7 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
-from orthocal.assessment.wording import name_offsets, tool_mm
+from orthocal.assessment.wording import name_offsets, tool_mm, um
 from orthocal.assessment.words.entries import (
     describe_compensated,
     describe_tool_error,
@@ -33,7 +33,7 @@ from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.estimation.selection import complete_model, select_parameters
 from orthocal.io.documents import format_json
 from orthocal.output.text.conditions import describe_conditions_of
-from orthocal.output.text.layout import noted, table_of, um
+from orthocal.output.text.layout import noted, table_of
 from orthocal.units import MM, UM, read_limit
 
 if TYPE_CHECKING:

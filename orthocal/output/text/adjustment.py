@@ -9,6 +9,7 @@ from rich.text import Text
 
 from orthocal.assessment.adjustment_plan import AdjustmentPlan, plan_adjustments
 from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.wording import plain, signed
 from orthocal.assessment.words.adjustment import (
     HEADLINES,
     describe_gain,
@@ -22,7 +23,7 @@ from orthocal.errors import ClosureError, OrthocalError
 from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.output.text.answer import render_next
-from orthocal.output.text.layout import bullets, indented, plain, print_rich, signed, table_of
+from orthocal.output.text.layout import bullets, indented, print_rich, table_of
 from orthocal.text import quote_path
 from orthocal.units import MM
 

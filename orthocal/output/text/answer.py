@@ -14,7 +14,7 @@ from rich.text import Text
 from orthocal.assessment.assess import assessment_of, gains_from_correction
 from orthocal.assessment.controller_entries import expanded_uncertainty, readings_limit
 from orthocal.assessment.plausibility import describe_legs
-from orthocal.assessment.wording import joined
+from orthocal.assessment.wording import counted, joined, plain, signed
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import (
     CHOICE_STEP,
@@ -35,14 +35,11 @@ from orthocal.output.text.accuracy import FurtherHour, describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
     bullets,
-    counted,
     indented,
     list_places,
     noted,
-    plain,
     section,
     short_name,
-    signed,
     table_of,
     table_of_records,
 )

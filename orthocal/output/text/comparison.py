@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.assessment.comparison import Comparison
-from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.wording import counted, mm, plain, signed, tool_mm, um
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import describe_region, find_settings_errors
 from orthocal.calibration.assessment_record import FindingKind
@@ -19,15 +19,10 @@ from orthocal.output.text.layout import (
     NOISE_SOURCES,
     bullets,
     choose_worst,
-    counted,
     indented,
-    mm,
     noted,
-    plain,
     section,
-    signed,
     table_of,
-    um,
 )
 from orthocal.robot.parameters import is_offset
 from orthocal.units import MM

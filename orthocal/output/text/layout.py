@@ -17,12 +17,6 @@ from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
-# the same number formats in tables and in sentences
-from orthocal.assessment.wording import counted as counted
-from orthocal.assessment.wording import mm as mm
-from orthocal.assessment.wording import plain as plain
-from orthocal.assessment.wording import signed as signed
-from orthocal.assessment.wording import um as um
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.io.html import items, paragraph, table
 from orthocal.text import printable
@@ -37,7 +31,6 @@ WORST_ROWS = 20
 
 LONGEST_NAME = 44
 """Longest name in a plot or a label, [characters]."""
-
 
 WIDTH = 100
 """Columns of plain text."""
@@ -58,7 +51,6 @@ NOISE_SOURCES = {
 
 BULLET = "• "
 """Start of an item of a list."""
-
 
 SHORTEST_WORD = 12
 """Columns that a column of words keeps when a table gets narrow; longer words are broken then."""

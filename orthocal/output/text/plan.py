@@ -12,7 +12,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
-from orthocal.assessment.wording import joined, name_offsets, tool_mm
+from orthocal.assessment.wording import counted, joined, name_offsets, tool_mm, um
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.io.documents import format_json
 from orthocal.kinematics.conditions import stated_use
@@ -31,7 +31,7 @@ from orthocal.output.text.accuracy import (
     describe_remaining,
     describe_remedy,
 )
-from orthocal.output.text.layout import bullets, counted, indented, section, table_of, um
+from orthocal.output.text.layout import bullets, indented, section, table_of
 from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN, Stage
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Criterion, Expected

@@ -12,10 +12,10 @@ from pydantic_core import to_jsonable_python
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.wording import joined, tool_mm
+from orthocal.assessment.wording import counted, joined, plain, tool_mm
 from orthocal.io.documents import format_json
 from orthocal.kinematics.workspace import describe_box
-from orthocal.output.text.layout import counted, noted, plain, section, table_of
+from orthocal.output.text.layout import noted, section, table_of
 from orthocal.study.accuracy import (
     AccuracyStudy,
     AccuracySummary,
@@ -23,11 +23,7 @@ from orthocal.study.accuracy import (
     summarise_accuracy,
 )
 from orthocal.study.bootstrap import BootstrapSummary, Scatter, summarise_bootstrap
-from orthocal.study.linearisation import (
-    LinearisationSummary,
-    MethodErrors,
-    summarise_linearisation,
-)
+from orthocal.study.linearisation import LinearisationSummary, MethodErrors, summarise_linearisation
 from orthocal.study.runner import StudyTable
 from orthocal.study.sensitivity import SensitivitySummary, summarise_sensitivity
 from orthocal.units import UM

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.fit_findings import find_held, find_unresolved
+from orthocal.assessment.wording import counted, mm, plain, signed
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.fit import MAX_LISTED
 from orthocal.calibration.assessment_record import FindingKind
@@ -22,12 +23,8 @@ from orthocal.output.text.answer import name_values
 from orthocal.output.text.layout import (
     NOISE_SOURCES,
     bullets,
-    counted,
-    mm,
     noted,
-    plain,
     residual_table,
-    signed,
     table_of,
     table_of_records,
 )

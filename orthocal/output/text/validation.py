@@ -9,6 +9,7 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of, gains_from_correction
 from orthocal.assessment.validation import Validation
+from orthocal.assessment.wording import mm, plain, signed
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.assessment_record import FindingKind
@@ -24,16 +25,7 @@ from orthocal.output.text.answer import (
     render_headline,
     render_next,
 )
-from orthocal.output.text.layout import (
-    bullets,
-    mm,
-    noted,
-    plain,
-    residual_table,
-    section,
-    signed,
-    table_of,
-)
+from orthocal.output.text.layout import bullets, noted, residual_table, section, table_of
 from orthocal.units import MM
 
 DETAILS: tuple[FindingKind, ...] = (
