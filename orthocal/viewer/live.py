@@ -12,7 +12,6 @@ import os
 import signal
 import socket
 import threading
-from types import TracebackType
 from typing import Any
 
 import tornado.httpserver
@@ -154,12 +153,7 @@ class LiveScene:
     def __enter__(self) -> LiveScene:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     async def _serve(self) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from operator import attrgetter
 
 import numpy as np
 
@@ -196,12 +197,14 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
     )
 
 
-def worst_of_setups(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
-    """Row with the largest deviation of every setup."""
-    worst: dict[str, Deviation] = {}
+def find_worst(
+    rows: Iterable[Deviation], key: Callable[[Deviation], object] = attrgetter("setup")
+) -> tuple[Deviation, ...]:
+    """Row with the largest deviation of every setup, or of every value of another key."""
+    worst: dict[object, Deviation] = {}
     for row in rows:
-        if row.setup not in worst or abs(row.before) > abs(worst[row.setup].before):
-            worst[row.setup] = row
+        if abs(row.before) > abs(worst.setdefault(key(row), row).before):
+            worst[key(row)] = row
     return tuple(worst.values())
 
 
@@ -227,7 +230,7 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
                 where="posture",
             )
         return [_stop_at(measured, posture, measured.rows, None)], 0
-    overview = Stop("overview", zero, measured.offsets, worst_of_setups(measured.rows))
+    overview = Stop("overview", zero, measured.offsets, find_worst(measured.rows))
     path: list[Stop] = []
     for place in dict.fromkeys(measured.place(r) for r in measured.rows):
         rows = [r for r in measured.rows if measured.place(r) == place]
@@ -244,7 +247,7 @@ def _stop_at(
     measured: Measurement, name: str, rows: Sequence[Deviation], place: Place | None
 ) -> Stop:
     """Stop at a posture with the deviations of some rows."""
-    deviations = worst_of_setups(r for r in rows if r.posture == name)
+    deviations = find_worst(r for r in rows if r.posture == name)
     minuends = dict.fromkeys(r.posture for r in rows if r.minus == name)
     offsets = measured.active.get(name, measured.offsets)
     return Stop(name, measured.drives[name], offsets, deviations, place, tuple(minuends))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
@@ -121,18 +122,14 @@ def draw_scene(
         raise ParameterError(f"'{show}' is none of {', '.join(SHOW_CHOICES)}", where="show")
     if isinstance(subject, Calibration):
         return _draw_calibration(subject, posture, exaggeration, show or SHOW_CHOICES[0])
-    if show is not None:
-        raise ParameterError("applies to a calibration only", where="show")
-    if exaggeration is not None:
-        raise ParameterError("applies to a calibration only", where="exaggeration")
+    for name, value in (("show", show), ("exaggeration", exaggeration)):
+        if value is not None:
+            raise ParameterError("applies to a calibration only", where=name)
     if isinstance(subject, Session):
         return _draw_session(subject, posture)
-    if isinstance(subject, Robot):
-        return _draw_robot(subject, posture)
-    raise TypeError(
-        f"found a {type(subject).__name__}; expected a Calibration, a Session or a Robot, such "
-        "as load_calibration(...)"
-    )
+    expected = "a Calibration, a Session or a Robot, such as load_calibration(...)"
+    require_kind(subject, Robot, expected=expected)
+    return _draw_robot(subject, posture)
 
 
 def _draw_robot(robot: Robot, posture: str | None) -> Scene:

@@ -10,7 +10,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.wording import counted
 from orthocal.kinematics.robot_functions import reference_poses
-from orthocal.output.scene.deviations import Deviation, Measurement, Place, Stop, worst_of_setups
+from orthocal.output.scene.deviations import Deviation, Measurement, Place, Stop, find_worst
 from orthocal.output.text.layout import list_places, short_name, typeset
 from orthocal.sensors.protocol import Contact, has_dial
 from orthocal.session.session import Setup
@@ -234,13 +234,11 @@ def _labelled_setups(
     """Names of setups that the overview labels; of many, the worst of each leg and direction."""
     if len(setups) <= MAX_ALL_LABELLED:
         return {s.name for s in setups}
-    worst: dict[tuple[Place, int], Deviation] = {}
-    for row in worst_of_setups(measured.rows):
-        axis = int(np.abs(contacts[row.setup].direction).argmax())
-        key = (measured.place(row), axis)
-        if key not in worst or abs(row.before) > abs(worst[key].before):
-            worst[key] = row
-    return {row.setup for row in worst.values()}
+
+    def place_and_axis(row: Deviation) -> tuple[Place, int]:
+        return measured.place(row), int(np.abs(contacts[row.setup].direction).argmax())
+
+    return {row.setup for row in find_worst(find_worst(measured.rows), place_and_axis)}
 
 
 def _find_contact(

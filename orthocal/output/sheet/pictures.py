@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import meshcat.geometry as g
 import numpy as np
@@ -84,16 +84,24 @@ class Box(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Label:
-    """A text, and the point that it names."""
+    """One or several lines of text, and the point that they name."""
 
+    point: ArrayLike
+    """The point, shape (2,), [mm]."""
     text: str
-    point: Array
-    wanted: Array
-    """Wanted middle of the text, shape (2,), [mm]."""
-    colour: str
-    size: float
-    bold: bool
-    leader: bool
+    shift: ArrayLike = (0.0, 0.0)
+    """From the point to the wanted middle of the text, shape (2,), [mm]."""
+    colour: str = "#111"
+    size: float = TEXT_SIZE
+    """Font size, [mm]."""
+    bold: bool = False
+    leader: bool = True
+    """Whether a line leads to the point if the label is far from it."""
+
+    @property
+    def wanted(self) -> Array:
+        """Wanted middle of the text, shape (2,), [mm]."""
+        return np.add(self.point, np.asarray(self.shift, dtype=np.float64))
 
     @property
     def half(self) -> Array:
@@ -185,31 +193,9 @@ class Picture:
             corners = np.array([end, end - head * way + side, end - head * way - side])
             self.polygon(corners, fill=stroke, stroke=stroke, width=0.1)
 
-    def label(
-        self,
-        point: ArrayLike,
-        text: str,
-        *,
-        shift: ArrayLike = (0.0, 0.0),
-        colour: str = "#111",
-        size: float = TEXT_SIZE,
-        bold: bool = False,
-        leader: bool = True,
-    ) -> None:
-        """A label for a point.
-
-        Args:
-            point: The point, shape (2,), [mm].
-            text: One or several lines.
-            shift: From the point to the wanted middle of the text, [mm].
-            colour: CSS.
-            size: Font size, [mm].
-            bold: In bold type.
-            leader: Draw a line to the point if the label is far from it.
-        """
-        at = np.asarray(point, dtype=np.float64)
-        wanted = at + np.asarray(shift, dtype=np.float64)
-        self.labels.append(_Label(text, at, wanted, colour, size, bold, leader))
+    def label(self, point: ArrayLike, text: str, **look: Any) -> None:  # noqa: ANN401 - of _Label
+        """A label for a point; see `_Label`."""
+        self.labels.append(_Label(point, text, **look))
 
     def place_labels(self) -> list[tuple[_Label, Box]]:
         """Boxes of the labels, disjoint and on the paper, in the order of their importance.
@@ -296,11 +282,12 @@ def _text(label: _Label, box: Box) -> str:
 def _leader(label: _Label, box: Box) -> str:
     """A thin line from a label to its point, if they are far apart."""
     low, high = np.array(box[:2]), np.array(box[2:])
-    edge = np.clip(label.point, low, high)
-    wanted = float(np.linalg.norm(label.wanted - label.point))
-    if not label.leader or np.linalg.norm(edge - label.point) < max(LEADER, wanted):
+    point = np.asarray(label.point, dtype=np.float64)
+    edge = np.clip(point, low, high)
+    wanted = float(np.linalg.norm(label.wanted - point))
+    if not label.leader or np.linalg.norm(edge - point) < max(LEADER, wanted):
         return ""
-    return f'<polyline points="{_pairs([edge, label.point])}" stroke="{GREY}" stroke-width="0.2"/>'
+    return f'<polyline points="{_pairs([edge, point])}" stroke="{GREY}" stroke-width="0.2"/>'
 
 
 def _pairs(points: ArrayLike) -> str:

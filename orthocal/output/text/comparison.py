@@ -164,15 +164,13 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     }
     rows = []
     for name in shown:
-        p, first = parameters[name], True
-        for r in results:
-            if name not in r.exact.estimates:
-                continue
-            linear, exact = (s.estimates[name] for s in (r.linearised, r.exact))
-            numbers = [signed(v * p.edge_factor) for v in (linear, exact)]
-            spread = plain(half[r.model, name])
-            rows.append((name if first else "", r.model, *numbers, spread, p.edge_unit))
-            first = False
+        p, label = parameters[name], name
+        for r in (r for r in results if name in r.exact.estimates):
+            values = (s.estimates[name] * p.edge_factor for s in (r.linearised, r.exact))
+            rows.append(
+                (label, r.model, *map(signed, values), plain(half[r.model, name]), p.edge_unit)
+            )
+            label = ""
     omitted = len(names) - len(shown)
     return noted(
         table_of(("parameter", "model", "linear", "exact", "±", "unit"), rows, left=2),

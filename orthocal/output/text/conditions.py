@@ -65,14 +65,13 @@ def describe_conditions_of(
     Returns:
         "" for a machine that depends on none of them.
     """
-    words = []
-    for name in effects_by_condition(calibration.robot):
-        if name not in fields:
-            continue
-        value = getattr(conditions, name)
-        unit = {"approach": "approach {}", "temperature": "{:g} °C", "payload": "payload {:g} kg"}
-        stated = value is not None
-        words.append(unit[name].format(value) if stated else _assumption(calibration, name))
+    forms = {"approach": "approach {}", "temperature": "{:g} °C", "payload": "payload {:g} kg"}
+    values = {f: getattr(conditions, f) for f in effects_by_condition(calibration.robot)}
+    words = [
+        _assumption(calibration, f) if value is None else forms[f].format(value)
+        for f, value in values.items()
+        if f in fields
+    ]
     return f"Conditions: {joined(words)}." if words else ""
 
 

@@ -250,18 +250,16 @@ def residual_table(
         all_rows: Whether to list all.
         key: Size by which the worst are chosen.
     """
-    cycles = any(r.cycle != 1 for r in residuals)
     rows, note = choose_worst(residuals, key, all_rows=all_rows)
-    cells = [
-        (
-            *(r.setup, r.postures),
-            *([str(r.cycle)] if cycles else []),
-            *(cell(r) for cell in columns.values()),
-        )
-        for r in rows
-    ]
-    headers = ("setup", "posture", *(["cycle"] if cycles else []), *columns)
-    return noted(table_of(headers, cells, left=2), *notes, note)
+    places: dict[str, Callable[[ResidualRow], str]] = {
+        "setup": lambda r: r.setup,
+        "posture": lambda r: r.postures,
+    }
+    if any(r.cycle != 1 for r in residuals):
+        places["cycle"] = lambda r: str(r.cycle)
+    shown = places | dict(columns)
+    cells = [[cell(r) for cell in shown.values()] for r in rows]
+    return noted(table_of(list(shown), cells, left=2), *notes, note)
 
 
 def short_name(text: str, longest: int = LONGEST_NAME, *, head: int | None = None) -> str:

@@ -151,11 +151,16 @@ def describe_assumed_tip(equipment: Equipment, session: Session) -> str:
 
 def describe_size(session: Session) -> str:
     """Numbers of readings and setups of a plan; readings are counted as on its sheet."""
+    setups, first, closing = _count_rows(session)
+    words = f" ({closing} closing)" if closing else ""
+    return f"{counted(first + closing, 'reading')}{words} in {counted(setups, 'setup')}"
+
+
+def _count_rows(session: Session) -> tuple[int, int, int]:
+    """Numbers of setups, of readings, and of those that close a setup, as on the sheet."""
     session = one_row_per_point(session)
     closing = sum(r.cycle > 1 for r in session.readings)
-    words = f" ({closing} closing)" if closing else ""
-    readings, setups = len(session.readings), len(session.setups)
-    return f"{counted(readings, 'reading')}{words} in {counted(setups, 'setup')}"
+    return len(session.setups), len(session.readings) - closing, closing
 
 
 def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
@@ -188,11 +193,13 @@ def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
 
 def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) -> list[str]:
     """Offsets that the readings do not determine, and the sensor that helps, as sentences."""
-    drives = _undetermined_offsets(plan)
-    if not drives:
-        return []
+    after = plan.expected
+    stds = np.sqrt(np.diag(after.covariance))
+    ratios = dict(zip(after.names, (stds / after.prior_stds).tolist(), strict=True))
+    names = (d.name for d in plan.session.robot.drives)
+    drives = [name for name in names if ratios.get(f"{name}.offset", 0.0) > DETERMINED]
     offsets = name_offsets(drives, firmware=False)
-    return [describe_remedy(offsets, gains, plan.expected.reported.rms)]
+    return [describe_remedy(offsets, gains, after.reported.rms)] if drives else []
 
 
 def describe_absent(plan: MeasuringPlan) -> list[str]:
@@ -224,15 +231,6 @@ def describe_absent(plan: MeasuringPlan) -> list[str]:
 def _unusable_names(plan: MeasuringPlan) -> list[str]:
     """Names of the gauges whose range is too small for their readings."""
     return [name or DIAL for name in plan.unusable]
-
-
-def _undetermined_offsets(plan: MeasuringPlan | FixedPlan) -> list[str]:
-    """Drives whose offset is as uncertain after the readings as before."""
-    after = plan.expected
-    stds = np.sqrt(np.diag(after.covariance))
-    ratios = dict(zip(after.names, (stds / after.prior_stds).tolist(), strict=True))
-    drives = (d.name for d in plan.session.robot.drives)
-    return [name for name in drives if ratios.get(f"{name}.offset", 0.0) > DETERMINED]
 
 
 def _describe_limits(effect: EffectLimits) -> str:
@@ -327,14 +325,13 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         }
 
     def alternative(a: Alternative) -> dict[str, Any]:
-        names = ("name", "setups", "readings", "minutes")
-        numbers = {name: getattr(a, name) for name in names}
+        numbers = {name: getattr(a, name) for name in ("name", "setups", "readings", "minutes")}
         return {**numbers, "in_range": a.expected is not None, **sizes(a.expected)}
 
     def stage(s: Stage) -> dict[str, float]:
         return {**asdict(s), "error": s.error / _unit(plan)}
 
-    read, closing = _counts(plan)
+    setups, read, closing = _count_rows(plan.session)
     box = plan.forecast.workspace.box
     basis = describe_basis(plan.session.robot)
     return {
@@ -343,7 +340,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "criterion": plan.criterion,
         "travel": basis["travel"],
         "workspace_mm": None if box is None else np.round(box / MM, 6).tolist(),
-        "setups": len(one_row_per_point(plan.session).setups),
+        "setups": setups,
         "readings": read,
         "closing_readings": closing,
         "minutes": plan.minutes,
@@ -388,13 +385,6 @@ def _unit(plan: MeasuringPlan) -> float:
     return 1.0 if plan.criterion in ("A", "D") else UM
 
 
-def _counts(plan: MeasuringPlan) -> tuple[int, int]:
-    """Numbers of readings, and of those that close a setup."""
-    readings = one_row_per_point(plan.session).readings
-    closing = sum(r.cycle > 1 for r in readings)
-    return len(readings) - closing, closing
-
-
 def _when_enough(plan: MeasuringPlan) -> str:
     """Number of setups beyond which another hour gains little, in a sentence."""
     if _unit(plan) != UM:
@@ -425,8 +415,8 @@ def _second_measurement(plan: MeasuringPlan, prefix: str) -> str:
 
 
 def _alternatives(plan: MeasuringPlan) -> RenderableType:
-    s = one_row_per_point(plan.session)
-    this = Alternative("this plan", len(s.setups), len(s.readings), plan.minutes, plan.expected)
+    setups, first, closing = _count_rows(plan.session)
+    this = Alternative("this plan", setups, first + closing, plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.usual_plans):
         error = OUT_OF_RANGE if a.expected is None else um(a.expected.reported.rms)
