@@ -9,8 +9,8 @@ from typing import Annotated
 from typer import Option
 
 import orthocal
-from orthocal.cli.files import load_joined
-from orthocal.cli.options import command, read_tolerances, split_effects, split_globs
+from orthocal.cli.files import load_each_once
+from orthocal.cli.options import command, read_tolerances, split_globs
 from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
 
@@ -93,8 +93,8 @@ def calibrate(
     """
     if out is not None:
         require_replaceable_results(out, dict.fromkeys(FILES, ""), force=force)
-    effects = split_effects(choice.effects)
-    session = load_joined(sessions, effects=effects, tolerance=choice.tolerance)
+    loaded = load_each_once(sessions, effects=choice.effects, tolerance=choice.tolerance)
+    session = orthocal.join_sessions(loaded)
     chosen = choice.read(session)
     options = orthocal.SolverOptions(
         solver=solver,  # type: ignore[arg-type] # checked by SolverOptions

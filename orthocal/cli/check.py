@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.files import load_joined
-from orthocal.cli.options import command, split_effects
+from orthocal.cli.files import load_each_once
+from orthocal.cli.options import command
 from orthocal.cli.printing import deliver_judged
 
 
@@ -24,7 +24,6 @@ def check(
 
     Exit code 0: no anomaly. 3: check the readings before you continue.
     """
-    session = load_joined(
-        sessions, effects=split_effects(effects), tolerance=tolerance, partial=True
-    )
-    deliver_judged(orthocal.check_session(session), json=json, details=details)
+    loaded = load_each_once(sessions, effects=effects, tolerance=tolerance, partial=True)
+    assessment = orthocal.check_session(orthocal.join_sessions(loaded))
+    deliver_judged(assessment, json=json, details=details)

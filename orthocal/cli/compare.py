@@ -6,7 +6,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import load_each_once
-from orthocal.cli.options import command, split_effects, split_globs
+from orthocal.cli.options import command, split_globs
 from orthocal.cli.printing import deliver_judged, judgement_on_failure, put_note
 
 
@@ -30,9 +30,8 @@ def compare(
         repeat (SESSION): Another session, to see which residuals repeat. May be stated several
             times.
     """
-    chosen = split_effects(effects)
-    loaded = load_each_once(sessions, effects=chosen, tolerance=tolerance)
-    others = load_each_once(repeat, effects=chosen, tolerance=tolerance) if repeat else None
+    loaded = load_each_once(sessions, effects=effects, tolerance=tolerance)
+    others = load_each_once(repeat, effects=effects, tolerance=tolerance) if repeat else None
     session = orthocal.join_sessions(loaded)
     with judgement_on_failure(session, json=json, details=details):
         comparison = orthocal.compare_models(

@@ -380,26 +380,21 @@ def _refuse_corrected(texts: Iterable[str], file: str) -> Iterator[str]:
 
 def _with_comments(texts: Iterable[str], comments: Sequence[str]) -> Iterator[str]:
     """Program with comments as its first lines, or after a % at its beginning."""
-    commented = False
-    for text in texts:
-        if commented or not text:
-            yield text
-            continue
-        commented = True
-        percent = re.match(r"\s*%[^\n]*(\n|$)", text)
-        split = percent.end() if percent else 0
-        line_end = "\r\n" if "\r\n" in text else "\n"
-        head = text[:split]
-        if head and not head.endswith("\n"):
-            head += line_end
-        parts = [part for comment in comments for part in _wrap(comment)]
-        lines = "".join(f"; {part}{line_end}" for part in parts)
-        yield f"{head}{lines}{text[split:]}"
-
-
-def _wrap(comment: str) -> list[str]:
-    """Lines of a comment that a controller reads completely."""
-    return wrap(comment, LONGEST_COMMENT if comment.isascii() else LONGEST_COMMENT // BYTES)
+    texts = iter(texts)
+    first = next((text for text in texts if text), "")
+    if not first:
+        return
+    percent = re.match(r"\s*%[^\n]*(\n|$)", first)
+    split = percent.end() if percent else 0
+    line_end = "\r\n" if "\r\n" in first else "\n"
+    head = first[:split]
+    if head and not head.endswith("\n"):
+        head += line_end
+    for comment in comments:  # a controller reads each line completely
+        longest = LONGEST_COMMENT if comment.isascii() else LONGEST_COMMENT // BYTES
+        head += "".join(f"; {part}{line_end}" for part in wrap(comment, longest))
+    yield head + first[split:]
+    yield from texts
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
@@ -504,22 +499,27 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
     backlash = 2.0 * lags
     if not by_program:
         backlash = result.compensated_backlash + backlash_changes(result, find_backlash(result))
-    listed = []
-    for drive, value in zip(result.robot.drives, backlash.tolist(), strict=True):
-        if float(format_fixed(value / drive.joint_size, 3)):
-            listed.append(f"{drive.name} {drive.show(value)}")
+    listed = ", ".join(
+        f"{drive.name} {drive.show(value)}"
+        for drive, value in zip(result.robot.drives, backlash.tolist(), strict=True)
+        if float(format_fixed(value / drive.joint_size, 3))
+    )
     if not listed:
         return ""
     if by_program and describe_trims(result.robot, result.session.compensation):
-        text = (
-            "Where drives reverse, the program takes up the backlash that the controller does not"
+        return (
+            "Where drives reverse, the program takes up the backlash that the controller does not "
+            f"compensate, as the session states: {listed}."
         )
-        return f"{text} compensate, as the session states: {', '.join(listed)}."
     if by_program:
-        text = f"Where drives reverse, the program takes up their backlash: {', '.join(listed)}."
-        return f"{text} The controller must not compensate it."
-    text = f"The controller must compensate the backlash of the drives: {', '.join(listed)}."
-    return f"{text} If it cannot, use --backlash program."
+        return (
+            f"Where drives reverse, the program takes up their backlash: {listed}. The controller "
+            "must not compensate it."
+        )
+    return (
+        f"The controller must compensate the backlash of the drives: {listed}. If it cannot, use "
+        "--backlash program."
+    )
 
 
 def _find_lags(result: orthocal.Calibration) -> Array:

@@ -29,15 +29,15 @@ the gauges were mounted exactly as before."""
 def load_each_once(
     paths: Sequence[Path],
     *,
-    effects: Sequence[str] | None = None,
-    tolerance: Sequence[str] | None = None,
+    effects: str | None = None,
+    tolerance: Sequence[str] | None,
     partial: bool = False,
 ) -> list[orthocal.Session]:
     """Load sessions, and refuse those whose readings would count twice.
 
     Args:
         paths: Their paths.
-        effects: Effects beside geometry that replace those of the sessions.
+        effects: Value of `--effects` that replaces the effects of the sessions.
         tolerance: Values of `--tolerance` that replace tolerances of the sessions.
         partial: Whether some of the readings may be missing.
 
@@ -54,25 +54,21 @@ def load_each_once(
         for other in sessions:
             _require_measured_again(session, other)
         sessions.append(session)
-    if effects is not None:
-        from orthocal.robot.parameters import errors_at
-
-        with errors_at("--effects"):
-            sessions = [session.with_effects(effects) for session in sessions]
+    sessions = [_state_effects(session, effects) for session in sessions]
     return [state_tolerances(session, tolerance) for session in sessions]
 
 
-def load_joined(
-    paths: Sequence[Path],
-    *,
-    effects: Sequence[str] | None = None,
-    tolerance: Sequence[str] | None = None,
-    partial: bool = False,
-) -> orthocal.Session:
-    """Load sessions and join them into one; for arguments and errors see `load_each_once`."""
-    return orthocal.join_sessions(
-        load_each_once(paths, effects=effects, tolerance=tolerance, partial=partial)
-    )
+def _state_effects(session: orthocal.Session, text: str | None) -> orthocal.Session:
+    """Session in which the effects of `--effects` replace its own.
+
+    Raises:
+        ParameterError: If an effect does not exist.
+    """
+    from orthocal.robot.parameters import errors_at
+
+    names = split_effects(text)
+    with errors_at("--effects"):
+        return session if names is None else session.with_effects(names)
 
 
 def require_not_calibrated(
@@ -209,17 +205,13 @@ def load_stated_plan(
         OrthocalError: If the plan does not load, or an option is invalid.
     """
     from orthocal.robot.loading import packaged_robots
-    from orthocal.robot.parameters import errors_at
 
     if not exists(path) and str(path) in packaged_robots():
         raise ParameterError(
             f"is a robot; expected a session.yaml, which `orthocal plan {path} --out ...` writes",
             where=str(path),
         )
-    plan = orthocal.load_plan(path)
-    if effects is not None:
-        with errors_at("--effects"):
-            plan = plan.with_effects(split_effects(effects))
+    plan = _state_effects(orthocal.load_plan(path), effects)
     return state_conditions(plan, read_temperatures(temperature))
 
 

@@ -20,7 +20,7 @@ from orthocal.cli.options import (
     read_workspace,
     split_effects,
 )
-from orthocal.cli.overwriting import require_new_session, write_plan
+from orthocal.cli.overwriting import READINGS, count_numbers, require_new_session, write_plan
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import following_command, note_contradictions
 from orthocal.errors import (
@@ -109,11 +109,11 @@ class DimensionOptions:
         """
         from orthocal.cli.dialogue import OPTIONS, Stated
 
-        stated: dict[str, Stated] = {}
-        for key, option in OPTIONS.items():
-            text = getattr(self, key)
-            if text is not None:
-                stated[key] = Stated(option, text)
+        stated = {
+            key: Stated(option, text)
+            for key, option in OPTIONS.items()
+            if (text := getattr(self, key)) is not None
+        }
         form = "KEY=VALUE, such as rod_mm=280"
         for key, value in read_pairs(self.dimension, "--dimension", form).items():
             if key in stated:
@@ -170,9 +170,7 @@ class FirstPlanOptions:
 
     def read_effects(self) -> dict[str, dict[str, float]]:
         """Effects of the machine, mapped to keys that replace their defaults."""
-        effects: dict[str, dict[str, float]] = {
-            name: {} for name in split_effects(self.effects) or []
-        }
+        effects = {name: dict[str, float]() for name in split_effects(self.effects) or []}
         if self.screw_lead_mm is not None:
             effects["screw"] = {"lead_mm": self.screw_lead_mm}
         return effects
@@ -494,16 +492,14 @@ def _report(folder: Path, design: _Design) -> None:
     )
 
     plan, size = design.plan, describe_size(design.session)
-    lines = [f"Plan: {size}."]
-    if plan is not None:
-        lines = [
-            f"Plan: {size}, about {show_duration(plan.minutes)}.",
-            *describe_expected(plan),
-        ]
-    if plan is not None and not isinstance(plan, orthocal.MeasuringPlan):
-        lines += [BED_WORDS, *describe_gains(plan.find_sensor_gains(), plan.expected.reported.rms)]
+    if plan is None:
+        lines = [f"Plan: {size}."]
+    else:
+        lines = [f"Plan: {size}, about {show_duration(plan.minutes)}.", *describe_expected(plan)]
     if isinstance(plan, orthocal.MeasuringPlan):
         lines += describe_absent(plan)
+    elif plan is not None:
+        lines += [BED_WORDS, *describe_gains(plan.find_sensor_gains(), plan.expected.reported.rms)]
     programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
         f"Wrote {folder}: {design.machine.words}.",
@@ -544,7 +540,7 @@ def _make_again(folder: Path) -> None:
         if changes:
             is_outdated = True
             advice = _advise_plan(folder, sheet.parent)
-            if _count_readings(sheet.parent):
+            if count_numbers(sheet.parent / READINGS):  # the session may not load
                 advice = (
                     "it has readings, so check the dimensions: with longer legs, for instance, "
                     "travel_mm is larger, too. For other dimensions, plan into another directory"
@@ -566,14 +562,6 @@ def _advise_plan(folder: Path, session: Path) -> str:
         "make the machine with its plan again, by the options with which you made it:\n  "
         f"orthocal new {quote_path(folder)} --force …"
     )
-
-
-def _count_readings(folder: Path) -> int:
-    """Number of readings in the table of a session, which may not load."""
-    from orthocal.cli.overwriting import count_numbers
-
-    table = folder / "readings.csv"
-    return count_numbers(table) if exists(table) else 0
 
 
 def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:

@@ -399,8 +399,10 @@ class Dialogue:
         name, argument = names[0], arguments[0] if arguments else ""
         examples = {"temperature": "21.5", "side": "p or n"}
         actions = {
-            **{"skip": self._skip, "clock": self._switch_clock, "list": self._list},
-            **{"show": self._show_again, "help": self._help, "quit": self._quit},
+            **{"skip": self._skip, "clock": self._switch_clock, "show": self._show_again},
+            "list": lambda: self._say(self._text.list_rows()),
+            "help": lambda: self._say(self._text.list_commands()),
+            "quit": self._quit,
         }
         if len(arguments) > (name not in actions):
             raise SessionError(f"`{name}` has no argument '{shorten(arguments[-1])}'")
@@ -449,12 +451,6 @@ class Dialogue:
     def _switch_clock(self) -> None:
         self._conditions.switch_clock()
         self._note(self._text.clock(on=self._conditions.clock))
-
-    def _list(self) -> None:
-        self._say(self._text.list_rows())
-
-    def _help(self) -> None:
-        self._say(self._text.list_commands())
 
     def _quit(self) -> None:
         raise _EndOfDialogue

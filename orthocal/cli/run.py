@@ -32,8 +32,8 @@ PANELS = {
 }
 """Panels of `orthocal --help` and their commands, in the order of work."""
 
-MODULES = {"import": "import_"}
-"""Modules of commands whose names are reserved words of Python."""
+MODULES = {"import": "import_", "inverse": "forward"}
+"""Modules of commands whose names are others: `import` is a reserved word of Python."""
 
 
 SLOW = frozenset(
