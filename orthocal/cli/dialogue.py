@@ -183,16 +183,13 @@ def _read(answers: Answers, question: _Question, stated: Stated) -> Answers:
     parts = stated.text.split(d.separator) if d.separator else [stated.text]
     if len(parts) != d.count:
         raise ParameterError(
-            f"found '{stated.text}'; expected {d.form}, in {d.unit}, such as {_example(d)}",
+            f"found '{stated.text}'; expected {d.form}, in {d.unit}, such as "
+            f"{d.usual or '100:320'}",
             where=stated.option,
         )
     value: Any = d.to_si([read_number(part, stated.option) for part in parts])
     changed: Any = {d.name: value}
     return answers._replace(dimensions=replace(answers.dimensions, **changed))
-
-
-def _example(dimension: Dimension) -> str:
-    return dimension.usual or "100:320"
 
 
 def _read_counting(answers: Answers, key: str, stated: Stated) -> tuple[Counting, ...]:

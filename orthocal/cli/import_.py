@@ -64,7 +64,9 @@ def import_(
         settings (FILE): Settings that a log lacks, such as printer.cfg, config.g or bed.g.
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
-    if format or settings or radius_mm is not None or _is_printer_log(table):
+    from orthocal.measurement.importing.printer_log import recognise_log
+
+    if format or settings or radius_mm is not None or recognise_log(table) is not None:
         _refuse_options(sheet, decimal, separator, unit, encoding, column, fill, replace)
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
@@ -111,13 +113,6 @@ def _refuse_options(*values: object) -> None:
     for name, value in zip(OF_TABLES, values, strict=True):
         if value:
             raise SessionError("is for tables; found the log of a printer", where=name)
-
-
-def _is_printer_log(table: Path) -> bool:
-    """True if the file is clearly a printer's log."""
-    from orthocal.measurement.importing.printer_log import recognise_log
-
-    return recognise_log(table) is not None
 
 
 def _session_file(session: Path) -> Path:

@@ -307,17 +307,10 @@ class Scene:
         policy = _POLICY.format(connect=connect)
         if connect != "'none'":
             policy = policy.replace("script-src", "script-src 'self'")
-        content = {
-            "title": self.title,
-            "headline": self.headline,
-            "facts": self.facts,
-            "camera": asdict(self.camera),
-            "labels": [asdict(label) for label in self.labels],
-            "legend": [asdict(entry) for entry in self.legend],
-            "steps": [asdict(step) for step in self.steps],
-            "commands": commands,
-            "live": connect != "'none'",
-        }
+        shown = ("title", "headline", "facts", "camera", "labels", "legend", "steps")
+        fields = asdict(self)
+        content = {name: fields[name] for name in shown}
+        content |= {"commands": commands, "live": connect != "'none'"}
         # escape "<", so that the data cannot end the script element
         data = json.dumps(_printable(content), ensure_ascii=False, allow_nan=False).replace(
             "<", "\\u003c"

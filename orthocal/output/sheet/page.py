@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from importlib import resources
 
+import numpy as np
+
 from orthocal.assessment.wording import counted
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.measurement.motion.approach import describe_approach
@@ -202,46 +204,38 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
 
     The firmware of a printer does not show its carriages.
     """
-    robot = session.robot
-    joints = robot.drives if session.firmware is None else ()
-    tool = motion.stops[0].point is not None
-    approaches = any(r.approach for r in session.readings)
-    to_note = _asked_for_each(session)
-    letters = [] if robot.tcp is None or not tool else ["xyz"[c] for c in robot.tcp.coordinates]
-    sensor = session.setups[motion.setup].sensor
+    robot, stops = session.robot, motion.stops
+    sensor, to_note = session.setups[motion.setup].sensor, _asked_for_each(session)
     boxes = AXES if isinstance(sensor, Points) else ("reading",)
-    expected = any(abs(s.expected) > VISIBLE for s in motion.stops)
-    headers = [
-        ("line", "number"),
-        ("posture", ""),
-        *([("approach", "")] if approaches else []),
-        *([(f"tool {', '.join(letters)} [mm]", "")] if letters else []),
-        *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in joints),
-        *([("perfect machine shows [mm]", "number")] if expected else []),
-        *((f"{box} [mm]", "") for box in boxes),
-        *((text, "") for text in to_note),
-        ("remarks", ""),
-    ]
-    head = "".join(f'<th class="{kind}">{escape(text)}</th>' for text, kind in headers)
-    rows = []
-    for stop in motion.stops:
-        cells = [("" if stop.line is None else str(stop.line), "number"), (_posture(stop), "")]
-        if approaches:
-            cells.append((describe_approach(robot, stop.approach), ""))
-        if tool and stop.point is not None:
-            shown = shown_tool(session, stop.point[None])[0]
-            cells.append((", ".join(map(show_length, shown)), ""))
-        if joints:
-            cells += [(text, "number") for text in joint_values(robot, stop.drives)]
-        if expected:
-            cells.append((show_number(stop.expected / MM, 2, sign=True), "number"))
-        body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
+    lines = ["" if s.line is None else str(s.line) for s in stops]
+    columns = [("line", "number", lines), ("posture", "", [_posture(s) for s in stops])]
+    approaches = any(r.approach for r in session.readings)
+    if approaches:
+        columns.append(("approach", "", [describe_approach(robot, s.approach) for s in stops]))
+    points = [s.point for s in stops if s.point is not None]
+    if robot.tcp is not None and points:
+        shown = [", ".join(map(show_length, p)) for p in shown_tool(session, np.array(points))]
+        letters = ", ".join("xyz"[c] for c in robot.tcp.coordinates)
+        columns.append((f"tool {letters} [mm]", "", shown))
+    if session.firmware is None:
+        headers = [f"{d.name} [{DRIVE_UNITS[d.unit][0]}]" for d in robot.drives]
+        values = zip(*(joint_values(robot, s.drives) for s in stops), strict=True)
+        columns += [(h, "number", list(v)) for h, v in zip(headers, values, strict=True)]
+    if any(abs(s.expected) > VISIBLE for s in stops):
+        readings = [show_number(s.expected / MM, 2, sign=True) for s in stops]
+        columns.append(("perfect machine shows [mm]", "number", readings))
+    empty = [*(f"{box} [mm]" for box in boxes), *to_note, "remarks"]
+    headings = [*((text, kind) for text, kind, _ in columns), *((text, "") for text in empty)]
+    head = "".join(f'<th class="{kind}">{escape(text)}</th>' for text, kind in headings)
+    body = ""
+    for i, stop in enumerate(stops):
+        cells = (f'<td class="{kind}">{escape(texts[i])}</td>' for _, kind, texts in columns)
         box = '<td class="box"></td>' * len(boxes)
         box = "<td>set to 0</td>" if stop.role == "subtracted" else box
         box += '<td class="box condition"></td>' * len(to_note)
         remark = escape(motion.closing(stop, sensor))
-        rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
-    kind, body = "boxes wide" if approaches or to_note else "boxes", "".join(rows)
+        body += f'<tr>{"".join(cells)}{box}<td class="note">{remark}</td></tr>'
+    kind = "boxes wide" if approaches or to_note else "boxes"
     return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 

@@ -425,25 +425,18 @@ class RecordingText:
             last: Index of the row that was read last; it is named first.
         """
         rows = self._recording.rows
-        indices = find_rows(finding, rows)
-        first = [i for i in indices if i == last]
-        parts = [
-            list(dict.fromkeys(rows[i].line or 0 for i in part))
-            for part in (first, indices)
-            if part
-        ]
-        if first and len(parts[1]) > 1:
-            parts[1].remove(parts[0][0])
-            where = f" ({spans(parts[0], 'line')}; or {spans(parts[1], 'line')})"
-        else:
-            where = f" ({spans(parts[-1], 'line')})" if parts else ""
-        where = "" if finding.words.startswith(("Line ", "Lines ")) else where
+        lines = list(dict.fromkeys(rows[i].line or 0 for i in find_rows(finding, rows)))
+        first = [n for n in lines if last is not None and n == rows[last].line]
+        parts = (first, [n for n in lines if n not in first])
+        named = "; or ".join(spans(part, "line") for part in parts if part)
+        is_named = not named or finding.words.startswith(("Line ", "Lines "))
+        where = "" if is_named else f" ({named})"
         head, *others = f"{finding.kind.capitalize()}{where}: {finding.words}".split("\n")
-        lines = [self.wrap(head, indent="  ", first="! ")]
+        paragraphs = [self.wrap(head, indent="  ", first="! ")]
         for other in others:  # causes, and what to do
             margin = "    " if other.startswith(" ") else ""
-            lines.append(self.wrap(other.strip(), indent=f"  {margin}", first=margin or "  "))
-        return "\n".join(lines)
+            paragraphs.append(self.wrap(other.strip(), indent=f"  {margin}", first=margin or "  "))
+        return "\n".join(paragraphs)
 
     def resolved(self, findings: Sequence[Finding]) -> str:
         """Warnings that the readings no longer support."""
