@@ -18,6 +18,8 @@ from orthocal.text import quote_path
 from orthocal.units import MM
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from orthocal.arrays import Array
 
 
@@ -44,11 +46,11 @@ def accuracy(
     Args:
         points (TARGETS.csv): Columns of the tool: x_mm, y_mm, z_mm.
     """
+    from orthocal.assessment.tool_error import MOST_POINTS
     from orthocal.export.formats import require_entering
     from orthocal.kinematics.workspace import cube
     from orthocal.measurement.files.coordinate_tables import read_points
     from orthocal.output.text.accuracy import accuracy_json, expect_further_hour, render_accuracy
-    from orthocal.output.text.layout import print_rich
 
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
@@ -64,7 +66,12 @@ def accuracy(
         if not json:
             _print_points(result, targets, names, conditions, calibration)
             return
-        _require_few(targets, points)
+        if len(targets) > MOST_POINTS:
+            raise SessionError(
+                f"contains {len(targets)} points; expected at most {MOST_POINTS} with --json, "
+                "which evaluates all together",
+                where=str(points),
+            )
         workspace = orthocal.Workspace.even(targets)
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * MM)
@@ -72,12 +79,12 @@ def accuracy(
     with _cube_reached(result, half_side_mm):
         assessment = orthocal.assess_tool(result, workspace, names=names, conditions=stated)
 
-    def show() -> None:
+    def render() -> RenderableType:
         is_default = workspace is None and stated is None
         further = expect_further_hour(result, None if is_default else assessment)
-        print_rich(render_accuracy(result, assessment, further))
+        return render_accuracy(result, assessment, further)
 
-    deliver(lambda: accuracy_json(result, assessment), show, json=json)
+    deliver(lambda: accuracy_json(result, assessment), render, json=json)
 
 
 def _print_points(
@@ -104,22 +111,6 @@ def _print_points(
         put_note(note)
         raise
     put_note(note)
-
-
-def _require_few(targets: Array, path: Path) -> None:
-    """Refuse too many points for an evaluation in one block.
-
-    Raises:
-        SessionError: If there are too many points; names their file.
-    """
-    from orthocal.assessment.tool_error import MOST_POINTS
-
-    if len(targets) > MOST_POINTS:
-        raise SessionError(
-            f"contains {len(targets)} points; expected at most {MOST_POINTS} with --json, "
-            "which evaluates all together",
-            where=str(path),
-        )
 
 
 @contextmanager

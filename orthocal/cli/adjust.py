@@ -41,6 +41,6 @@ def adjust(
     plan = orthocal.plan_adjustments(result, among=names)
     deliver(
         lambda: text.plan_json(result, plan),
-        lambda: text.print_plan(result, plan, saved=calibration, details=details),
+        lambda: text.render_titled_plan(result, plan, saved=calibration, details=details),
         json=json,
     )

@@ -32,9 +32,8 @@ from orthocal.units import MM, UM, format_fixed
 if TYPE_CHECKING:
     from orthocal.arrays import Array
     from orthocal.export.correction_field import CorrectionField
-    from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.path import Vector
-    from orthocal.gcode.program import ProgramCorrector, Summary
+    from orthocal.gcode.program import Summary
     from orthocal.kinematics.conditions import UseCondition
     from orthocal.kinematics.workspace import Workspace
 
@@ -135,7 +134,7 @@ def correct(
     if not anyway:
         require_entering(result)
     file = "standard input" if str(program) == "-" else str(program)
-    correction = _prepare(result, options, controller, file)
+    correction = _Correction(result, options, controller, file)
     warning = warn_against_verdict(result)
     mark = f"{MARK}: calibration {_identify(calibration)}. Do not correct again."
     comments = [mark, *correction.list_comments(), warning]
@@ -172,25 +171,59 @@ def _read_controller(options: CorrectionOptions) -> _Controller:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Correction:
-    """Correction of one program, and the facts for its notes."""
+    """Correction of one program by a calibration, and the facts for its notes.
 
-    result: orthocal.Calibration
-    controller: _Controller
-    file: str
-    conditions: orthocal.UseConditions
-    field: CorrectionField
-    tolerance: float
-    """Largest distance of the written path from the corrected path, [m]."""
-    backlash: str
-    """Description of the compensation of the backlash; empty if there is none."""
-    interpreter: Interpreter
-    corrector: ProgramCorrector
-    region: str
-    """Description of the workspace."""
-    for_controller: str
-    """Description of the offsets in the controller."""
+    Raises:
+        OrthocalError: If a condition of use is invalid, or the correction cannot be computed.
+    """
+
+    def __init__(
+        self,
+        result: orthocal.Calibration,
+        options: CorrectionOptions,
+        controller: _Controller,
+        file: str,
+    ) -> None:
+        from orthocal.assessment.controller_entries import offsets_to_enter
+        from orthocal.export.approach_sides import ApproachSides
+        from orthocal.export.correction_field import CorrectionField
+        from orthocal.gcode.interpreter import Interpreter
+        from orthocal.gcode.program import ProgramCorrector
+
+        active, tip = options.offsets is Offsets.ACTIVE, controller.tip
+        values = result.active_offsets if active else offsets_to_enter(result)
+        self.result, self.controller, self.file = result, controller, file
+        self.tolerance = options.within * UM
+        """Largest distance of the written path from the corrected path, [m]."""
+        self.conditions = orthocal.UseConditions(None, options.temperature, options.payload)
+        self.conditions.require_valid(result.robot, prefix="--")
+        self.field = CorrectionField(
+            result,
+            values,
+            within=self.tolerance,
+            tool=tip or (0.0, 0.0, 0.0),
+            conditions=self.conditions,
+            aligned_over=_find_workspace(result),
+        )
+        self.interpreter = Interpreter(
+            file,
+            axes=self.field.axes,
+            offsets=controller.work_offsets,
+            origin=result.session.controller_origin,
+            start=controller.start,
+            one_tool=tip is not None,
+        )
+        region, self.region = _find_region(result)
+        lags = _find_lags(result)
+        usual = Backlash.PROGRAM if active else Backlash.CONTROLLER
+        by_program = (options.backlash or usual) is Backlash.PROGRAM and bool(lags.any())
+        sides = ApproachSides(result, values, lags) if by_program else None
+        self.backlash = _describe_backlash(result, lags, by_program=by_program)
+        self.corrector = ProgramCorrector(
+            self.interpreter, self.field, within=self.tolerance, region=region, sides=sides
+        )
+        self.for_controller = _describe_controller(result, values, active=active)
 
     def list_comments(self) -> list[str]:
         """Comments about controller and machine; empty ones do not apply."""
@@ -239,63 +272,6 @@ class _Correction:
         if summary.unit_assumed:
             notes.append("No G20 or G21 before the first coordinates: read as mm.")
         return notes
-
-
-def _prepare(
-    result: orthocal.Calibration, options: CorrectionOptions, controller: _Controller, file: str
-) -> _Correction:
-    """Prepare the correction of a program by a calibration.
-
-    Raises:
-        OrthocalError: If a condition of use is invalid, or the correction cannot be computed.
-    """
-    from orthocal.assessment.controller_entries import offsets_to_enter
-    from orthocal.export.approach_sides import ApproachSides
-    from orthocal.export.correction_field import CorrectionField
-    from orthocal.gcode.interpreter import Interpreter
-    from orthocal.gcode.program import ProgramCorrector
-
-    active, tip = options.offsets is Offsets.ACTIVE, controller.tip
-    values = result.active_offsets if active else offsets_to_enter(result)
-    tolerance = options.within * UM
-    conditions = orthocal.UseConditions(None, options.temperature, options.payload)
-    conditions.require_valid(result.robot, prefix="--")
-    field = CorrectionField(
-        result,
-        values,
-        within=tolerance,
-        tool=tip or (0.0, 0.0, 0.0),
-        conditions=conditions,
-        aligned_over=_find_workspace(result),
-    )
-    interpreter = Interpreter(
-        file,
-        axes=field.axes,
-        offsets=controller.work_offsets,
-        origin=result.session.controller_origin,
-        start=controller.start,
-        one_tool=tip is not None,
-    )
-    region, words = _find_region(result)
-    lags = _find_lags(result)
-    usual = Backlash.PROGRAM if active else Backlash.CONTROLLER
-    by_program = (options.backlash or usual) is Backlash.PROGRAM and bool(lags.any())
-    sides = ApproachSides(result, values, lags) if by_program else None
-    return _Correction(
-        result=result,
-        controller=controller,
-        file=file,
-        conditions=conditions,
-        field=field,
-        tolerance=tolerance,
-        backlash=_describe_backlash(result, lags, by_program=by_program),
-        interpreter=interpreter,
-        corrector=ProgramCorrector(
-            interpreter, field, within=tolerance, region=region, sides=sides
-        ),
-        region=words,
-        for_controller=_describe_controller(result, values, active=active),
-    )
 
 
 def _put_program(spool: IO[bytes], out: Path | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,9 +34,7 @@ def forward(calibration: Path, joints: Path, *, use: UseOptions) -> None:
     from orthocal.measurement.files.coordinate_tables import TOOL_COLUMNS, stream_joints
 
     result = orthocal.load_calibration(calibration)
-    conditions = use.read(result.robot)
-    transform = partial(forward_blocks, conditions=conditions)
-    _print_transformed(result, joints, stream_joints, transform, TOOL_COLUMNS, conditions)
+    _print_transformed(result, use, joints, stream_joints, forward_blocks, TOOL_COLUMNS)
 
 
 @command()
@@ -55,34 +53,34 @@ def inverse(calibration: Path, targets: Path, *, use: UseOptions) -> None:
     from orthocal.measurement.files.coordinate_tables import drive_columns, stream_points
 
     result = orthocal.load_calibration(calibration)
-    conditions = use.read(result.robot)
-    columns, transform = drive_columns(result.robot), partial(inverse_blocks, conditions=conditions)
-    _print_transformed(result, targets, stream_points, transform, columns, conditions)
+    columns = drive_columns(result.robot)
+    _print_transformed(result, use, targets, stream_points, inverse_blocks, columns)
 
 
 def _print_transformed(
     calibration: orthocal.Calibration,
+    use: UseOptions,
     path: Path,
     stream: Callable[..., Iterator[Block]],
-    transform: Callable[[orthocal.Calibration, Iterable[Block]], Iterator[Chunk]],
+    transform: Callable[..., Iterator[Chunk]],
     columns: dict[str, float],
-    conditions: orthocal.UseConditions,
 ) -> None:
     """Print a transformed table; a file is checked completely before its first row is printed.
 
     Args:
         calibration: The calibration.
+        use: Conditions of use; a note lists the assumed ones.
         path: The table; - for standard input.
         stream: Function that reads a file or a stream in blocks.
         transform: Function from these blocks to chunks of the transformed table.
         columns: Columns of the transformed table and their factors to SI units.
-        conditions: Conditions of use; a note lists the assumed ones.
 
     Raises:
         SessionError: If a row is wrong; names file and line.
     """
     from orthocal.measurement.files.coordinate_tables import format_rows
 
+    conditions = use.read(calibration.robot)
     if str(path) != "-":
         for _ in stream(path, calibration.robot, name=str(path)):
             pass
@@ -92,7 +90,8 @@ def _print_transformed(
     else:
         blocks = stream(sys.stdin.buffer, calibration.robot, name="standard input")
     put_assumed(calibration, conditions)
-    print_rows(columns, partial(format_rows, columns), transform(calibration, blocks))
+    chunks = transform(calibration, blocks, conditions=conditions)
+    print_rows(columns, partial(format_rows, columns), chunks)
 
 
 def put_assumed(calibration: orthocal.Calibration, conditions: orthocal.UseConditions) -> None:

@@ -93,7 +93,7 @@ def _show(result: orthocal.TableImport, *, dry_run: bool, json: bool) -> None:
         orthocal.write_import(result)
     deliver(
         lambda: format_import_json(result, written=written),
-        lambda: put_out(printable(format_import(result), keep="\n")),
+        lambda: format_import(result),
         json=json,
     )
     if written:
@@ -170,7 +170,7 @@ def _import_printer(
     written = None if dry_run else write_printer_import(result, directory)
     deliver(
         lambda: format_printer_json(result, log, written),
-        lambda: put_out(printable(describe_printer_import(result), keep="\n")),
+        lambda: describe_printer_import(result),
         json=json,
     )
     for note in result.log.notes:

@@ -208,7 +208,7 @@ def new(
         free = {"--hours": options.hours, "--temperature": options.temperature}
         _require_none(free | {"--with": options.with_}, "--paper, whose setups are fixed")
     name = _require_new(folder, force=force)
-    design = _design(name, dimensions, options, controller)
+    design = _Design(name, dimensions, options, controller)
     _write(folder, name, design)
     _report(folder, design)
     note_contradictions(design.session, controller.ini)
@@ -220,76 +220,60 @@ def new(
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Design:
-    """New machine and its first plan, before they are written."""
-
-    machine: Dimensions
-    counting: tuple[Counting, ...]
-    effects: EffectKeyValues
-    tolerance_stated: bool
-    """Whether the tolerance of the zeros of the joints was stated."""
-    plan: orthocal.MeasuringPlan | FixedPlan | None
-    """Plan; None for the paper's readings."""
-    session: orthocal.Session
-    assumed_tip: str
-    """Note about a tip that the file of the gauge does not state."""
-    files: dict[str, str]
-    """Text of the files beside session.yaml and readings.csv, by name."""
-
-
-def _design(
-    name: str,
-    dimensions: DimensionOptions,
-    options: FirstPlanOptions,
-    controller: ControllerOptions,
-) -> _Design:
-    """Design a machine from options and answers, with its first plan.
+    """New machine and its first plan from options and answers, before they are written.
 
     Raises:
         OrthocalError: If an option or answer is invalid, or there is no suitable plan.
     """
-    from orthocal.cli.dialogue import ask_tolerance, find_answers
-    from orthocal.output.text.plan import describe_assumed_tip
-    from orthocal.planning.equipment import load_dial
-    from orthocal.planning.owned_sensors import load_owned_sensor
 
-    equipment = orthocal.Equipment(
-        temperatures=read_temperatures(options.temperature),
-        owned=tuple(load_owned_sensor(path) for path in options.with_ or ()),
-    )
-    if options.gauge is not None:
-        equipment = load_dial(options.gauge, equipment)
-    effects = options.read_effects()
-    kind, tolerance = dimensions.read_kind(), options.tolerance
-    reads_legs = kind.read_legs or bool(equipment.owned)
-    if not reads_legs:
-        _require_bed(kind, options)
-    machine, counting, asked = find_answers(kind, dimensions.by_key())
-    with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        robot = _make_trial(machine, Path(trial) / name, counting, effects)
-        robot = _with_workspace(robot, options.workspace_mm, asked=asked)
-        if asked and tolerance is None:
-            tolerance = ask_tolerance(USUAL_OFFSET)
-        if robot.workspace is not None:
-            box = tuple((low, high) for low, high in robot.workspace.tolist())
-            machine = replace(machine, workspace=box)
-        compensation = controller.read(robot)
-        tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
-        make_plan = _plan if reads_legs else _plan_bed
-        plan, session = make_plan(robot, equipment, tolerances, options)
-        session = session if compensation is None else replace(session, compensation=compensation)
-        put_note("orthocal: drawing the measuring sheet")
-        return _Design(
-            machine=machine,
-            counting=counting,
-            effects=effects,
-            tolerance_stated=tolerance is not None,
-            plan=plan,
-            session=session,
-            assumed_tip=describe_assumed_tip(equipment, session),
-            files=_draw(plan, session),
+    def __init__(
+        self,
+        name: str,
+        dimensions: DimensionOptions,
+        options: FirstPlanOptions,
+        controller: ControllerOptions,
+    ) -> None:
+        from orthocal.cli.dialogue import ask_tolerance, find_answers
+        from orthocal.output.text.plan import describe_assumed_tip
+        from orthocal.planning.equipment import load_dial
+        from orthocal.planning.owned_sensors import load_owned_sensor
+
+        equipment = orthocal.Equipment(
+            temperatures=read_temperatures(options.temperature),
+            owned=tuple(load_owned_sensor(path) for path in options.with_ or ()),
         )
+        if options.gauge is not None:
+            equipment = load_dial(options.gauge, equipment)
+        self.effects = options.read_effects()
+        kind, tolerance = dimensions.read_kind(), options.tolerance
+        reads_legs = kind.read_legs or bool(equipment.owned)
+        if not reads_legs:
+            _require_bed(kind, options)
+        self.machine, self.counting, asked = find_answers(kind, dimensions.by_key())
+        with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
+            folder = Path(trial) / name
+            robot = _make_trial(self.machine, folder, self.counting, self.effects)
+            robot = _with_workspace(robot, options.workspace_mm, asked=asked)
+            if asked and tolerance is None:
+                tolerance = ask_tolerance(USUAL_OFFSET)
+            self.tolerance_stated = tolerance is not None
+            """Whether the tolerance of the zeros of the joints was stated."""
+            if robot.workspace is not None:
+                box = tuple((low, high) for low, high in robot.workspace.tolist())
+                self.machine = replace(self.machine, workspace=box)
+            compensation = controller.read(robot)
+            tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
+            make_plan = _plan if reads_legs else _plan_bed
+            self.plan: orthocal.MeasuringPlan | FixedPlan | None
+            self.plan, self.session = make_plan(robot, equipment, tolerances, options)
+            if compensation is not None:
+                self.session = replace(self.session, compensation=compensation)
+            put_note("orthocal: drawing the measuring sheet")
+            self.assumed_tip = describe_assumed_tip(equipment, self.session)
+            """Note about a tip that the file of the gauge does not state."""
+            self.files = _draw(self.plan, self.session)
+            """Text of the files beside session.yaml and readings.csv, by name."""
 
 
 def _write(folder: Path, name: str, design: _Design) -> None:

@@ -103,7 +103,6 @@ def plan(
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
     """
     from orthocal.output.text.answer import calibrate_command
-    from orthocal.output.text.layout import print_rich
     from orthocal.output.text.plan import describe_assumed_tip, plan_json, render_plan
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
@@ -111,11 +110,7 @@ def plan(
         require_new_session(out, FILES, force=force)
     workers = options.workers or available_cores()
     chosen = _choose(subject, options, controller, workers=workers)
-    deliver(
-        lambda: plan_json(chosen),
-        lambda: print_rich(render_plan(chosen, details=details)),
-        json=json,
-    )
+    deliver(lambda: plan_json(chosen), lambda: render_plan(chosen, details=details), json=json)
     put_note(describe_assumed_tip(chosen.equipment, chosen.session))
     if out is not None:
         sessions = [Path(subject), out] if chosen.complements_session else [out]

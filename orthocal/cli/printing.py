@@ -17,6 +17,8 @@ from orthocal.io.files import Content, write_files
 from orthocal.text import printable
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from orthocal.assessment.tool_tables import Chunk
 
     Judged = orthocal.Assessment | orthocal.Calibration | orthocal.Comparison | orthocal.Validation
@@ -41,7 +43,7 @@ def put_note(text: str) -> None:
 
 def deliver(
     document: Callable[[], str],
-    show: Callable[[], object],
+    render: Callable[[], RenderableType],
     *,
     json: bool,
     out: Path | None = None,
@@ -51,15 +53,20 @@ def deliver(
 
     Args:
         document: Function that returns the result as JSON.
-        show: Function that prints the result as text.
+        render: Function that returns the result for the terminal: rich renderables, or lines that
+            are not wrapped.
         json: Whether to print JSON instead of text.
         out: Directory of the files; None to write no files.
         files: Function that returns the contents of the files by name.
     """
+    from orthocal.output.text.layout import print_rich
+
     if json:
         put_out(document().rstrip("\n"))
+    elif isinstance(rendered := render(), str):
+        put_out(printable(rendered, keep="\n"))
     else:
-        show()
+        print_rich(rendered)
     if out is not None:
         write_results(out, files())
 
@@ -81,16 +88,14 @@ def deliver_judged(
     """
     from orthocal.calibration.assessment_record import Assessment
     from orthocal.output.text.answer import render_decision
-    from orthocal.output.text.layout import print_rich
     from orthocal.output.text.summary import assessment_in, render_result, result_json
 
-    def show() -> None:
+    def render() -> RenderableType:
         if isinstance(result, Assessment):
-            print_rich(render_decision(result, **shown))
-        else:
-            print_rich(render_result(result, **shown))
+            return render_decision(result, **shown)
+        return render_result(result, **shown)
 
-    deliver(lambda: result_json(result), show, json=json, out=out, files=files)
+    deliver(lambda: result_json(result), render, json=json, out=out, files=files)
     if code := assessment_in(result).decision.exit_code:
         raise typer.Exit(code)
 

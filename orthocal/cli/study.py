@@ -302,7 +302,6 @@ def bootstrap(
 
 def _run(study: orthocal.Study, options: RunOptions) -> None:
     """Run a study, print its report and write its files."""
-    from orthocal.output.text.layout import print_rich
     from orthocal.output.text.study import render_report, report_study, study_json
     from orthocal.runtime.interrupts import message_at_interrupt
     from orthocal.runtime.worker_pool import available_cores, call_in_parallel, worker_budget
@@ -337,7 +336,7 @@ def _run(study: orthocal.Study, options: RunOptions) -> None:
         document = study_json(table, report)
         deliver(
             lambda: document,
-            lambda: print_rich(render_report(report)),
+            lambda: render_report(report),
             json=options.json,
             out=out,
             files=files,

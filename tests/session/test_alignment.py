@@ -27,7 +27,7 @@ from orthocal.calibration.identify import identify
 from orthocal.estimation.tolerance_scale import AS_STATED
 from orthocal.measurement.motion.guidance import guide
 from orthocal.measurement.motion.motion import plan_motion
-from orthocal.output.sheet.gauge_position import find_gauge_position
+from orthocal.output.sheet.gauge_position import GaugePosition
 from orthocal.session.session import Gauge
 from orthocal.statistics.chance import confidence_factor
 
@@ -290,7 +290,7 @@ def test_a_ball_is_centred_on_the_rod_in_its_alignment_posture(tmp_path):
     # the sheet states the distance from the centre line in the alignment posture
     guidance = guide(plan)
     for motion in plan_motion(plan):
-        position = find_gauge_position(plan, motion, guidance, ())
+        position = GaugePosition(plan, motion, guidance, ())
         assert np.linalg.norm(position.lateral_offset) < 1e-8
     assert load_session(write_session(plan.with_values([0.0] * 4), tmp_path / "copy")).setups[
         "xy"

@@ -9,8 +9,7 @@ by another factor.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -46,9 +45,6 @@ from orthocal.viewer.motion import (
 )
 from orthocal.viewer.scene import Scene, round_scale
 
-Poses = Mapping[str, Array]
-"""Frame to poses, shape (F, 4, 4), [m]."""
-
 SHOW_CHOICES = ("readings", "tool", "all")
 """Initially visible content of a calibration's scene."""
 
@@ -70,23 +66,6 @@ MAX_TRAVEL = 1.0
 MACHINE = "Machine"
 GHOST = "Machine, nominal (ghost)"
 SOLID = "Machine, calibrated"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Machines:
-    """The nominal and the calibrated machine in all frames of a motion."""
-
-    timeline: Timeline
-    nominal: Poses
-    """Poses of the nominal machine."""
-    drawn: Poses
-    """Poses of the calibrated machine with enlarged deviation."""
-    exaggeration: float
-    """Factor that enlarges the deviation."""
-    largest: float
-    """Largest deviation of a frame, [m]."""
-    frame: str
-    """Name of the frame with the largest deviation."""
 
 
 def draw_scene(
@@ -230,7 +209,7 @@ def _draw_calibration(
     drawing = MachineScene(measured.robot, title, sensor_frames=_sensor_frames(measured))
     scene = drawing.scene
     stops, omitted = plan_stops(measured, posture)
-    machines = _place_machines(calibration, measured, stops, drawing, exaggeration)
+    machines = _Machines(calibration, measured, stops, drawing, exaggeration)
     timeline, real = machines.timeline, machines.drawn
     drawing.draw_machine(SOLID, "Calibrated machine", timeline, real)
     if machines.largest > NEGLIGIBLE:
@@ -239,7 +218,7 @@ def _draw_calibration(
     drawing.draw_leg_lines(timeline, real)
     drawing.look_at(real, machines.nominal)
     scene.exaggeration = machines.exaggeration
-    scene.facts.insert(0, _state_deviation(machines))
+    scene.facts.insert(0, machines.describe())
     readings, tool = show in ("readings", "all"), show in ("tool", "all")
     draw_readings(drawing, measured, stops, timeline, real, shown=readings)
     tool_headline = draw_tool_errors(drawing, calibration, shown=tool)
@@ -256,55 +235,71 @@ def _draw_calibration(
     return scene
 
 
-def _place_machines(
-    calibration: Calibration,
-    measured: Measurement,
-    stops: Sequence[Stop],
-    drawing: MachineScene,
-    exaggeration: float | None,
-) -> _Machines:
-    """Poses of the nominal and of the calibrated machine in every frame."""
-    robot, frames, size = measured.robot, drawing.all_frames, drawing.size
-    rigid = {n: v for n, v in calibration.errors.items() if robot.parameters.are_rigid(n)}
-    machine = robot.with_errors(rigid)
-    nominal_loops, real_loops = nominal_closure(robot), LoopClosure(robot, fixed=calibration.errors)
-    n, motion = len(robot.drives), plan_motion([np.append(s.drives, s.offsets) for s in stops])
-    timeline = Timeline(motion.drives[:, :n], motion.times, motion.stops)
-    expected = motion.drives[:, :n] + motion.drives[:, n:]
-    assumed = Timeline(expected, motion.times, motion.stops)
-    nominal = _follow(nominal_loops, robot, assumed, frames)
-    real = _follow(real_loops, machine, timeline, frames)
-    # the largest deviation includes postures that are not shown
-    drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
-    offsets = [measured.active.get(name, measured.offsets) for name in measured.drives]
-    expected = drives + np.array([measured.offsets, *offsets])
-    largest, frame = find_largest_shift(
-        place_frames(robot, expected, nominal_loops.close(expected), drawing.frames),
-        place_frames(machine, drives, real_loops.close(drives), drawing.frames),
-    )
-    if exaggeration is None:
-        exaggeration = round_scale(
-            DEFAULT_DEVIATION * size / largest if largest > NEGLIGIBLE else 1.0
-        )
-    limit = math.inf if largest == 0.0 else MAX_DEVIATION * size / largest
-    if exaggeration > limit:
-        raise ParameterError(
-            f"is {exaggeration:g}; the largest deviation of {largest / MM:.3g} mm would be drawn "
-            f"larger than the machine: expected at most {math.floor(limit)}",
-            where="exaggeration",
-        )
-    drawn = {name: exaggerate(nominal[name], real[name], exaggeration) for name in real}
-    return _Machines(timeline, nominal, drawn, exaggeration, largest, frame)
+class _Machines:
+    """The nominal and the calibrated machine in all frames of a motion.
 
+    Args:
+        calibration: The calibration.
+        measured: Its deviations.
+        stops: The stops of the motion.
+        drawing: The scene.
+        exaggeration: Factor that enlarges the deviation; None for a visible deviation.
 
-def _state_deviation(machines: _Machines) -> str:
-    """Sentence with the size and the scale of the machine's deviation."""
-    if machines.largest <= NEGLIGIBLE:
-        return "The calibrated machine does not deviate from the nominal one."
-    scale = "true scale"
-    if machines.exaggeration != 1.0:
-        scale = f"deviation × {machines.exaggeration:g}"
-    return f"Machine: {scale} (largest {machines.largest / MM:.3f} mm, at {machines.frame})."
+    Raises:
+        ParameterError: If the factor is too large.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        measured: Measurement,
+        stops: Sequence[Stop],
+        drawing: MachineScene,
+        exaggeration: float | None,
+    ) -> None:
+        robot, frames, size = measured.robot, drawing.all_frames, drawing.size
+        rigid = {n: v for n, v in calibration.errors.items() if robot.parameters.are_rigid(n)}
+        machine, nominal = robot.with_errors(rigid), nominal_closure(robot)
+        real = LoopClosure(robot, fixed=calibration.errors)
+        n, motion = len(robot.drives), plan_motion([np.append(s.drives, s.offsets) for s in stops])
+        self.timeline = Timeline(motion.drives[:, :n], motion.times, motion.stops)
+        expected = motion.drives[:, :n] + motion.drives[:, n:]
+        assumed = Timeline(expected, motion.times, motion.stops)
+        self.nominal = _follow(nominal, robot, assumed, frames)
+        """Frame to poses of the nominal machine, shape (F, 4, 4), [m]."""
+        poses = _follow(real, machine, self.timeline, frames)
+        # the largest deviation includes postures that are not shown
+        drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
+        offsets = [measured.active.get(name, measured.offsets) for name in measured.drives]
+        expected = drives + np.array([measured.offsets, *offsets])
+        self.largest, self.frame = find_largest_shift(
+            place_frames(robot, expected, nominal.close(expected), drawing.frames),
+            place_frames(machine, drives, real.close(drives), drawing.frames),
+        )
+        """Largest deviation of a frame, [m], and the name of this frame."""
+        usual = DEFAULT_DEVIATION * size / self.largest if self.largest > NEGLIGIBLE else 1.0
+        self.exaggeration = round_scale(usual) if exaggeration is None else exaggeration
+        limit = math.inf if self.largest == 0.0 else MAX_DEVIATION * size / self.largest
+        if self.exaggeration > limit:
+            raise ParameterError(
+                f"is {self.exaggeration:g}; the largest deviation of {self.largest / MM:.3g} mm "
+                f"would be drawn larger than the machine: expected at most {math.floor(limit)}",
+                where="exaggeration",
+            )
+        self.drawn = {
+            name: exaggerate(self.nominal[name], pose, self.exaggeration)
+            for name, pose in poses.items()
+        }
+        """Frame to poses of the calibrated machine with enlarged deviation."""
+
+    def describe(self) -> str:
+        """Sentence with the size and the scale of the machine's deviation."""
+        if self.largest <= NEGLIGIBLE:
+            return "The calibrated machine does not deviate from the nominal one."
+        scale = "true scale"
+        if self.exaggeration != 1.0:
+            scale = f"deviation × {self.exaggeration:g}"
+        return f"Machine: {scale} (largest {self.largest / MM:.3f} mm, at {self.frame})."
 
 
 def _sensor_frames(measured: Measurement) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,36 +23,60 @@ NEAR_HINGE = 0.012
 """Smallest distance of a tip from the end of a rod that needs no warning, [m]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class GaugePosition:
-    """Position of a gauge in the alignment posture and in those that it reads."""
+    """Position of a gauge in the alignment posture of its setup and in those that it reads.
 
-    setup: Setup
-    leg: Leg | None
-    """The measured leg, if the sensor is at a leg."""
-    rod: Rod | None
-    """The touched rod; None for the line between the rods and for other sensors."""
-    contact: Contact
-    """Contact in the K postures of the setup, the alignment posture included."""
-    poses: Mapping[str, Array]
-    """Poses of the links and of the leg's frames in the alignment posture, shape (4, 4), [m]."""
-    alignment: str
-    """Posture in which the operator aligns the gauge."""
-    drives: Array
-    """Nominal drive coordinates of the alignment posture, shape (n_drives,), [m, rad]."""
-    aligned: int
-    """Index of the alignment posture in `contact`."""
-    coordinates: Array
-    """Point of contact in the alignment posture from `origin_name`, shape (3,), [m]."""
-    origin_name: str
-    """Origin of `coordinates`: the tool centre point in the alignment posture."""
-    tool_path: Array
-    """Tool points of all stops, in order, shape (n, 3); (0, 3) without a tool, [m]."""
-    hinge_distances: Array
-    """Distance of the contact from the rod's hinge at the drive, shape (K,), [m]."""
-    lateral_offset: Array
-    """From the rod's axis to the tip, across rod and plunger, in the alignment posture, shape
-    (3,), [m]."""
+    Args:
+        session: The plan.
+        motion: The motion through the setup.
+        guidance: Guidance for the plan.
+        links: Frames whose poses are needed.
+    """
+
+    def __init__(
+        self, session: Session, motion: SetupMotion, guidance: Guidance, links: tuple[str, ...]
+    ) -> None:
+        robot, setup = session.robot, session.setups[motion.setup]
+        self.setup = setup
+        self.leg, self.rod = _find_touched(robot, setup)
+        """The measured leg, if the sensor is at a leg, and the touched rod; no rod for the line
+        between the rods."""
+        names, self.contact = guidance.contacts[setup.name]
+        """Contact in the K postures of the setup, the alignment posture included."""
+        self.alignment = session.alignment_postures[setup.name]
+        """Posture in which the operator aligns the gauge."""
+        self.aligned = names.index(self.alignment)
+        """Index of the alignment posture in `contact`."""
+        drives, q = _coordinates(session, guidance, names)
+        self.drives = drives[self.aligned]
+        """Nominal drive coordinates of the alignment posture, shape (n_drives,), [m, rad]."""
+        parts = [] if self.leg is None else [*self.leg.rods.values(), self.leg]
+        wanted = dict.fromkeys([*links, *(frame for p in parts for frame in (p.root, p.tip))])
+        poses = place_frames(robot, self.drives[None], q[self.aligned][None], tuple(wanted))
+        self.poses: Mapping[str, Array] = {name: pose[0] for name, pose in poses.items()}
+        """Poses of the links and of the leg's frames in the alignment posture, shape (4, 4),
+        [m]."""
+        self.hinge_distances, self.lateral_offset = np.full(len(names), np.nan), np.zeros(3)
+        """Distance of the contact from the rod's hinge at the drive, shape (K,), and vector from
+        the rod's axis to the tip, across rod and plunger, in the alignment posture, shape (3,),
+        [m]."""
+        if self.rod is not None:
+            self.hinge_distances, normals, axes = _locate_on_rod(
+                robot, self.rod, drives, q, self.contact
+            )
+            self.lateral_offset = _find_lateral_offset(
+                self.rod, self.contact, normals[self.aligned], axes[self.aligned]
+            )
+        self.coordinates, self.origin_name = guidance.contact_point(setup.name)
+        """Point of contact in the alignment posture, shape (3,), [m], from an origin: the tool
+        centre point in the alignment posture."""
+        self.tool_path = np.zeros((0, 3))
+        """Tool points of all stops, in order, shape (n, 3); (0, 3) without a tool, [m]."""
+        if robot.tcp is not None:
+            way = np.array([s.drives for s in motion.stops])
+            on_way = np.array([guidance.passive[s.posture] for s in motion.stops])
+            tool = robot.tcp.frame
+            self.tool_path = place_frames(robot, way, on_way, (tool,))[tool][:, :3, 3]
 
     @property
     def tip(self) -> TouchingTip | None:
@@ -77,59 +100,6 @@ class GaugePosition:
         distances = np.minimum(self.hinge_distances, self.rod.length - self.hinge_distances)
         smallest = float(distances.min())
         return smallest if smallest < max(NEAR_HINGE, 2.0 * self.rod.radius) else None
-
-
-def find_gauge_position(
-    session: Session,
-    motion: SetupMotion,
-    guidance: Guidance,
-    links: tuple[str, ...],
-) -> GaugePosition:
-    """Position of the gauge of one setup.
-
-    Args:
-        session: The plan.
-        motion: The motion through the setup.
-        guidance: Guidance for the plan.
-        links: Frames whose poses are needed.
-    """
-    robot, setup = session.robot, session.setups[motion.setup]
-    leg, rod = _find_touched(robot, setup)
-    names, contact = guidance.contacts[motion.setup]
-    alignment = session.alignment_postures[motion.setup]
-    aligned = names.index(alignment)
-    drives, q = _coordinates(session, guidance, names)
-    rods = [] if leg is None else list(leg.rods.values())
-    ends = [frame for r in rods for frame in (r.root, r.tip)]
-    ends += [] if leg is None else [leg.root, leg.tip]
-    wanted = tuple(dict.fromkeys([*links, *ends]))
-    poses = place_frames(robot, drives[aligned][None], q[aligned][None], wanted)
-    distances, lateral_offset = np.full(len(names), np.nan), np.zeros(3)
-    if rod is not None:
-        distances, normals, axes = _locate_on_rod(robot, rod, drives, q, contact)
-        lateral_offset = _find_lateral_offset(rod, contact, normals[aligned], axes[aligned])
-    coordinates, origin_name = guidance.contact_point(motion.setup)
-    tool_path = np.zeros((0, 3))
-    if robot.tcp is not None:
-        way = np.array([s.drives for s in motion.stops])
-        on_way = np.array([guidance.passive[s.posture] for s in motion.stops])
-        tool = robot.tcp.frame
-        tool_path = place_frames(robot, way, on_way, (tool,))[tool][:, :3, 3]
-    return GaugePosition(
-        setup=setup,
-        leg=leg,
-        rod=rod,
-        contact=contact,
-        poses={name: pose[0] for name, pose in poses.items()},
-        alignment=alignment,
-        drives=drives[aligned],
-        aligned=aligned,
-        coordinates=coordinates,
-        origin_name=origin_name,
-        tool_path=tool_path,
-        hinge_distances=distances,
-        lateral_offset=lateral_offset,
-    )
 
 
 def hinge_distances(session: Session, setup: str, guidance: Guidance) -> dict[str, float]:

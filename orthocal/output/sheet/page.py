@@ -20,7 +20,7 @@ from orthocal.measurement.motion.motion_program import (
 from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.conditions import needed_conditions
 from orthocal.output.sheet.coordinates import joint_values, show_length, show_number
-from orthocal.output.sheet.gauge_position import GaugePosition, find_gauge_position
+from orthocal.output.sheet.gauge_position import GaugePosition
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.sheet.rules import (
     CHECKS_OF_PRINTER,
@@ -88,7 +88,7 @@ def sheet_files(
     guidance = guide(session)
     setups = []
     for motion in motions:
-        gauge = find_gauge_position(session, motion, guidance, links)
+        gauge = GaugePosition(session, motion, guidance, links)
         pictures = draw_machine(session.robot, visuals, gauge)
         pictures += draw_section(gauge) if gauge.leg is not None else draw_tool(gauge)
         setups.append(_setup(session, motion, gauge, pictures, with_program=bool(programs)))

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import meshcat.geometry as g
 import numpy as np
@@ -71,15 +71,6 @@ LEADER = 5.0
 """Distance from its point above which a label has a leader line, [mm]."""
 
 _NARROW, _WIDE = frozenset(" .,:;'|!()[]ijltfr"), frozenset("mwMW@%&+−<>=~…QO")
-
-
-class Box(NamedTuple):
-    """Rectangle that a label needs, [mm]."""
-
-    left: float
-    top: float
-    right: float
-    bottom: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,27 +188,27 @@ class Picture:
         """A label for a point; see `_Label`."""
         self.labels.append(_Label(point, text, **look))
 
-    def place_labels(self) -> list[tuple[_Label, Box]]:
-        """Boxes of the labels, disjoint and on the paper, in the order of their importance.
+    def place_labels(self) -> list[tuple[_Label, Array]]:
+        """Labels and their middles, disjoint and on the paper, in the order of their importance.
 
         Each label gets the free place nearest to where it is wanted; what it would cover counts
         as distance. A label without any free place is left out.
         """
         count = self._count_drawn()
-        placed: list[tuple[_Label, Box]] = []
+        placed: list[tuple[_Label, Array]] = []
         for label in self.labels:
             for reach in REACHES:
-                box, cost = self._place(label, placed, count, reach)
+                middle, cost = self._place(label, placed, count, reach)
                 if cost <= reach:  # farther places cost more
                     break
-            if box is not None:
-                placed.append((label, box))
+            if middle is not None:
+                placed.append((label, middle))
         return placed
 
     def _place(
-        self, label: _Label, placed: Sequence[tuple[_Label, Box]], count: Array, reach: float
-    ) -> tuple[Box | None, float]:
-        """Best free place of a label and its cost, [mm]; None without a place within reach."""
+        self, label: _Label, placed: Sequence[tuple[_Label, Array]], count: Array, reach: float
+    ) -> tuple[Array | None, float]:
+        """Best free middle of a label and its cost, [mm]; None without a place within reach."""
         half = label.half
         low, high = half + GAP, np.array([self.width, self.height]) - half - GAP
         if (low > high).any():
@@ -226,10 +217,8 @@ class Picture:
         lines = [np.r_[w, np.arange(a, b, STEP)] for w, a, b in zip(wanted, low, high, strict=True)]
         x, y = (v[np.abs(v - w) <= reach] for v, w in zip(lines, label.wanted, strict=True))
         centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        for _, box in placed:
-            size = 0.5 * np.array([box.right - box.left, box.bottom - box.top])
-            middle = 0.5 * np.array([box.left + box.right, box.top + box.bottom])
-            apart = (np.abs(centres - middle) >= half + size + GAP).any(axis=1)
+        for other, middle in placed:
+            apart = (np.abs(centres - middle) >= half + other.half + GAP).any(axis=1)
             centres = centres[apart]
         if not len(centres):
             return None, math.inf
@@ -239,8 +228,7 @@ class Picture:
         covered = count[c, d] - count[a, d] - count[c, b] + count[a, b]
         cost = np.linalg.norm(centres - label.wanted, axis=1) + COVERING * covered
         best = int(cost.argmin())
-        box = Box(*(centres[best] - half).tolist(), *(centres[best] + half).tolist())
-        return box, float(cost[best])
+        return centres[best], float(cost[best])
 
     def _count_drawn(self) -> Array:
         """Number of drawn points between the upper left corner and each corner of the cells."""
@@ -265,11 +253,11 @@ class Picture:
         )
 
 
-def _text(label: _Label, box: Box) -> str:
+def _text(label: _Label, middle: Array) -> str:
     weight = ' font-weight="bold"' if label.bold else ""
-    x, step = 0.5 * (box.left + box.right), LINE_HEIGHT * label.size
+    top, step = middle[1] - label.half[1], LINE_HEIGHT * label.size
     lines = "".join(
-        f'<tspan x="{x:.2f}" y="{box.top + (i + 0.78) * step:.2f}">{escape(line)}</tspan>'
+        f'<tspan x="{middle[0]:.2f}" y="{top + (i + 0.78) * step:.2f}">{escape(line)}</tspan>'
         for i, line in enumerate(label.text.split("\n"))
     )
     return (
@@ -279,11 +267,10 @@ def _text(label: _Label, box: Box) -> str:
     )
 
 
-def _leader(label: _Label, box: Box) -> str:
+def _leader(label: _Label, middle: Array) -> str:
     """A thin line from a label to its point, if they are far apart."""
-    low, high = np.array(box[:2]), np.array(box[2:])
     point = np.asarray(label.point, dtype=np.float64)
-    edge = np.clip(point, low, high)
+    edge = np.clip(point, middle - label.half, middle + label.half)
     wanted = float(np.linalg.norm(label.wanted - point))
     if not label.leader or np.linalg.norm(edge - point) < max(LEADER, wanted):
         return ""

@@ -23,7 +23,7 @@ from orthocal.errors import ClosureError, OrthocalError
 from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.output.text.answer import render_next
-from orthocal.output.text.layout import bullets, indented, print_rich, table_of
+from orthocal.output.text.layout import bullets, indented, table_of
 from orthocal.text import quote_path
 from orthocal.units import MM
 
@@ -50,13 +50,12 @@ def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -
         return Text(f"The adjustments cannot be planned: {e}.")
 
 
-def print_plan(
+def render_titled_plan(
     calibration: Calibration, plan: AdjustmentPlan, *, saved: Path, details: bool
-) -> None:
-    """Print a plan of adjustments; arguments as for `render_plan`."""
+) -> RenderableType:
+    """A plan of adjustments with a title; arguments as for `render_plan`."""
     head = f"Mechanical adjustment of {calibration.robot_record.name}, model '{calibration.model}'"
-    shown = render_plan(plan, saved=saved, details=details)
-    print_rich(Group(Text(head), Text(), shown))
+    return Group(Text(head), Text(), render_plan(plan, saved=saved, details=details))
 
 
 def render_plan(

@@ -69,6 +69,11 @@ def drawn(plan):
     return pictures, re.findall(r"<svg.*?</svg>", page)
 
 
+def box_of(label, middle):
+    """Left, top, right and bottom, [mm]."""
+    return (*(middle - label.half), *(middle + label.half))
+
+
 def overlap(one, other):
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
@@ -81,11 +86,10 @@ def test_no_label_overlaps_another_or_the_border(plan, drawn):
     for picture, placed in pictures:
         assert len(placed) == len(picture.labels)
         for one, other in combinations(placed, 2):
-            assert not overlap(one[1], other[1]), (one[0].text, other[0].text)
-        for label, box in placed:
-            assert min(box.left, box.top) >= 0.0, label.text
-            assert box.right <= picture.width, label.text
-            assert box.bottom <= picture.height, label.text
+            assert not overlap(box_of(*one), box_of(*other)), (one[0].text, other[0].text)
+        for label, middle in placed:
+            assert (middle >= label.half).all(), label.text
+            assert (middle + label.half <= (picture.width, picture.height)).all(), label.text
 
 
 def test_labels_in_a_browser_are_inside_their_boxes(drawn, tmp_path):
@@ -102,20 +106,18 @@ def test_labels_in_a_browser_are_inside_their_boxes(drawn, tmp_path):
     for (_, placed), texts in zip(pictures, extents, strict=True):
         for one, other in combinations(texts, 2):
             assert not overlap(one, other)
-        for (label, box), (left, top, right, bottom) in zip(placed, texts, strict=True):
-            assert left >= box.left - ROUNDED, label.text
-            assert top >= box.top - ROUNDED, label.text
-            assert right <= box.right + ROUNDED, label.text
-            assert bottom <= box.bottom + ROUNDED, label.text
+        for (label, middle), extent in zip(placed, texts, strict=True):
+            outside = np.abs(np.reshape(extent, (2, 2)) - middle) > label.half + ROUNDED
+            assert not outside.any(), label.text
 
 
 def test_a_label_keeps_off_lines_and_stays_near_its_point():
     picture = Picture(60.0, 40.0)
     picture.line([(5.0, 20.0), (55.0, 20.0)])
     picture.label((30.0, 20.0), "rod a")
-    ((label, box),) = picture.place_labels()
-    assert box.bottom < 20.0 or box.top > 20.0
-    assert np.hypot(0.5 * (box.left + box.right) - 30.0, 0.5 * (box.top + box.bottom) - 20.0) < 5.0
+    ((label, middle),) = picture.place_labels()
+    assert abs(middle[1] - 20.0) > label.half[1]
+    assert np.linalg.norm(middle - (30.0, 20.0)) < 5.0
     assert label.text == "rod a"
 
 
