@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,8 +75,10 @@ def accuracy(
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * MM)
     stated = conditions if conditions.stated else None
-    with _cube_reached(result, half_side_mm):
+    try:
         assessment = orthocal.assess_tool(result, workspace, names=names, conditions=stated)
+    except ClosureError as e:
+        raise _out_of_reach(result, half_side_mm, e) from None
 
     def render() -> RenderableType:
         is_default = workspace is None and stated is None
@@ -113,27 +114,23 @@ def _print_points(
     put_note(note)
 
 
-@contextmanager
-def _cube_reached(result: orthocal.Calibration, half_side_mm: float | None) -> Iterator[None]:
-    """Replace the error about a posture out of reach by one about the stated cube.
+def _out_of_reach(
+    result: orthocal.Calibration, half_side_mm: float | None, error: ClosureError
+) -> SessionError:
+    """Error about a posture out of reach, or about the stated cube.
 
     Args:
         result: The calibration.
         half_side_mm: Half the side of the cube; None if the option is absent.
-
-    Raises:
-        SessionError: If the block raises ClosureError.
+        error: The posture and the reason.
     """
     from orthocal.kinematics.workspace import describe_box
 
-    try:
-        yield
-    except ClosureError as e:
-        if half_side_mm is None:
-            raise SessionError(e.reason, where=e.posture) from None
-        workspace = describe_box(orthocal.assess_tool(result).workspace.limits)
-        raise SessionError(
-            f"the machine does not reach a cube of ±{half_side_mm:g} mm; the default is "
-            f"{workspace} ({e.reason})",
-            where="--half-side-mm",
-        ) from None
+    if half_side_mm is None:
+        return SessionError(error.reason, where=error.posture)
+    workspace = describe_box(orthocal.assess_tool(result).workspace.limits)
+    return SessionError(
+        f"the machine does not reach a cube of ±{half_side_mm:g} mm; the default is "
+        f"{workspace} ({error.reason})",
+        where="--half-side-mm",
+    )

@@ -80,8 +80,6 @@ def export(
     write_results(out, files)
     if result.session.firmware is not None:
         _show_settings(result, to, calibration, out)
-    if "kinematics.ini" in files:
-        _note_payload(result, payload)
     if to == "linuxcnc":
         _note_assumptions(result, options, ini, module="kinematics.ini" in files)
     if "README.md" in files and result.session.firmware is None:
@@ -117,10 +115,14 @@ def _note_assumptions(
     *,
     module: bool,
 ) -> None:
-    """Note the assumed order of sessions, and directions in which homing latches the switches."""
+    """Note the assumed payload, order of sessions, and directions of homing onto the switches."""
     from orthocal.export.formats import note_wrong_order
     from orthocal.export.linuxcnc.export import assumes_latching
+    from orthocal.output.text.conditions import describe_assumed
 
+    if module:
+        conditions = orthocal.UseConditions(payload=options.payload)
+        put_note(describe_assumed(calibration, conditions, fields=["payload"]))
     put_note(note_wrong_order(calibration))
     if module and options.module is None and options.home_offsets:
         put_note(
@@ -134,14 +136,6 @@ def _note_assumptions(
             f"half of the backlash in {'the module' if module else 'HOME_OFFSET'}. If it is "
             f"negative, state the signs by {'--ini FILE or ' * (ini is None)}--latched."
         )
-
-
-def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> None:
-    """Note the assumed payload of a module, if it is not stated and has an effect."""
-    from orthocal.output.text.conditions import describe_assumed
-
-    conditions = orthocal.UseConditions(payload=payload)
-    put_note(describe_assumed(calibration, conditions, fields=["payload"]))
 
 
 def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:

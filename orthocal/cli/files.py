@@ -87,36 +87,19 @@ def require_not_calibrated(
     if len(records) != len(parts):  # one session, or joined ones whose files are unknown
         records = (record_of_all,) * len(parts)
     for record, part in zip(records, parts, strict=True):
-        other = replace(
-            part,
-            path=None if record.path is None else Path(record.path),
-            postures=_own_postures(part),
-            readings=tuple(_without_label(r, joined=part.joined) for r in part.readings),
-        )
+        other = replace(part, path=None if record.path is None else Path(record.path))
         for session in sessions:
             if not session.was_read_from(record.sha256):  # `validate_calibration` refuses it
                 _require_measured_again(session, other)
 
 
-def _own_postures(part: orthocal.Session) -> dict[str, orthocal.Posture]:
-    """Postures of a part of a session, with their names in its own session."""
+def _key_in_session(reading: orthocal.Reading, *, joined: bool) -> tuple[object, ...]:
+    """Key of a reading of a session that may be joined, with the names of its own session."""
     from orthocal.session.session import split_label
 
-    names = {name: split_label(name, joined=part.joined) for name in part.postures}
-    return {names[n][1]: p for n, p in part.postures.items() if names[n][0] in part.labels}
-
-
-def _without_label(reading: orthocal.Reading, *, joined: bool) -> orthocal.Reading:
-    """Reading of a session that may be joined, with the names of its own session."""
-    from orthocal.session.session import split_label
-
-    minus = reading.minus
-    return replace(
-        reading,
-        setup=split_label(reading.setup, joined=joined)[1],
-        posture=split_label(reading.posture, joined=joined)[1],
-        minus=None if minus is None else split_label(minus, joined=joined)[1],
-    )
+    *names, cycle = reading.key[:4]
+    own = (None if n is None else split_label(n, joined=joined)[1] for n in names)
+    return (*own, cycle, *reading.key[4:])
 
 
 def _require_measured_again(session: orthocal.Session, other: orthocal.Session) -> None:
@@ -125,7 +108,11 @@ def _require_measured_again(session: orthocal.Session, other: orthocal.Session) 
     Raises:
         SessionError: If it is a copy; names both sessions and the lines that differ.
     """
-    values = {r.key: _measured(other, r) for r in other.readings if r.is_read}
+    values = {
+        _key_in_session(r, joined=other.joined): _measured(other, r)
+        for r in other.readings
+        if r.is_read
+    }
     common = [r for r in session.readings if r.is_read and r.key in values]
     equal = [r for r in common if _are_equal(_measured(session, r), values[r.key])]
     complete = len(equal) == len(session.readings) == len(other.readings)

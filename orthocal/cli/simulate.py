@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import orthocal
@@ -66,12 +65,7 @@ def simulate(
     path = orthocal.write_session(simulated.session, out, comment=comment, extra=truth)
     count = count_readings(simulated.session)
     put_note(f"Wrote {path}, {count} simulated readings, and truth.yaml")
-    if errors is not None:
-        _report_drawn(drawn_gauge_errors(simulated, true_errors), errors, out)
-
-
-def _report_drawn(drawn: Mapping[str, float], errors: Path, out: Path) -> None:
-    """Print the errors of gauges that a file of errors does not state."""
+    drawn = {} if errors is None else drawn_gauge_errors(simulated, true_errors)
     if drawn:
         values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
         put_note(

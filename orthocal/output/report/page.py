@@ -208,12 +208,11 @@ def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
 def _fit(calibration: Calibration) -> str:
     """Content of the section with the residuals."""
     parts = [to_markup(render_fit(calibration))]
-    if any(not math.isnan(r.prediction_error) for r in calibration.residuals):
-        text = (
-            "Predicted: readings of each setup, predicted from all other setups. A good model "
-            "predicts them nearly as well as it fits them."
-        )
-    else:
+    text = (
+        "Predicted: readings of each setup, predicted from all other setups. A good model predicts "
+        "them nearly as well as it fits them."
+    )
+    if all(math.isnan(r.prediction_error) for r in calibration.residuals):
         text = "No setup can be predicted: the other setups do not determine the model."
     parts.append(_figure(plot_setups(calibration), text))
     parts.append(
@@ -259,6 +258,8 @@ def _parameters(calibration: Calibration) -> str:
 
 def _research(calibration: Calibration) -> str:
     """Content of the section for research: linearisation, correlations, identifiability."""
+    few = len(calibration.free) <= MAX_IN_DETAIL
+    tables = to_markup(render_identifiability(calibration, all_rows=True))
     linearised = _figure(
         plot_linearised(calibration),
         "Exact solution minus the solution of the linear equations, as in the paper.",
@@ -268,7 +269,8 @@ def _research(calibration: Calibration) -> str:
         + heading("Correlations", level=3)
         + _correlations(calibration)
         + heading("Identifiability", level=3)
-        + _identifiability(calibration)
+        + _figure(plot_singular_values(calibration), "")
+        + (tables if few else _details("Tables", tables))
     )
 
 
@@ -286,15 +288,6 @@ def _correlations(calibration: Calibration) -> str:
     more = f", the strongest 20 of {len(pairs)}" if len(pairs) > 20 else ""
     return _figure(figure, f"The table lists pairs above 0.5{more}.") + table(
         ("parameter", "with", "correlation"), rows, left=2
-    )
-
-
-def _identifiability(calibration: Calibration) -> str:
-    """Plot and tables of the identifiability."""
-    few = len(calibration.free) <= MAX_IN_DETAIL
-    tables = to_markup(render_identifiability(calibration, all_rows=True))
-    return _figure(plot_singular_values(calibration), "") + (
-        tables if few else _details("Tables", tables)
     )
 
 
