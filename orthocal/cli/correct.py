@@ -23,7 +23,7 @@ from typer import Option
 import orthocal
 from orthocal.cli.options import command, read_vector
 from orthocal.cli.overwriting import require_replaceable_file
-from orthocal.cli.printing import put_note, put_part
+from orthocal.cli.printing import put_note
 from orthocal.errors import CalibrationFileError, GcodeError, OutputError, ParameterError
 from orthocal.io.files import is_folder, read_file, read_parts, write_file
 from orthocal.text import comment_safe, shorten
@@ -282,7 +282,7 @@ def _put_program(spool: IO[bytes], out: Path | None) -> None:
     # a byte in another encoding becomes one question mark: lines keep their length
     with io.TextIOWrapper(spool, encoding="utf-8", errors="surrogateescape", newline="") as text:
         while part := text.read(BLOCK_SIZE):
-            put_part(part)
+            sys.stdout.write(part)
     sys.stdout.flush()
 
 

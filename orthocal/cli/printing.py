@@ -30,11 +30,6 @@ def put_out(text: str) -> None:
     sys.stdout.flush()
 
 
-def put_part(text: str) -> None:
-    """Print a part of a long result on stdout."""
-    sys.stdout.write(text)
-
-
 def put_note(text: str) -> None:
     """Print a note on stderr; an empty one does not apply."""
     if text:

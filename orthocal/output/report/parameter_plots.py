@@ -205,10 +205,8 @@ def plot_singular_values(calibration: Calibration) -> Figure | None:
     axes = figure.subplots()
     index = np.arange(1, values.size + 1)
     above = values > spectrum.threshold / MM
-    for chosen, face, label in (
-        (above, AFTER, "above the noise"),
-        (~above, "white", "below the noise"),
-    ):
+    kinds = ((above, AFTER, "above the noise"), (~above, "white", "below the noise"))
+    for chosen, face, label in kinds:
         if chosen.any():
             look = {**AFTER_LOOK, "markerfacecolor": face}
             axes.plot(index[chosen], values[chosen], label=label, **look)

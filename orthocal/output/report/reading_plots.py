@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from operator import attrgetter
 from typing import cast
 
@@ -18,7 +17,6 @@ from orthocal.assessment.circular_deviation import Circle
 from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.residual_rows import (
-    ResidualRow,
     root_mean_square,
     rows_by_setup,
 )
@@ -61,7 +59,9 @@ def plot_residuals(calibration: Calibration) -> Figure:
     title = "Readings before and after calibration, the worst first"
     if len(rows) < len(residuals):
         title = f"Readings before and after calibration: the {len(rows)} worst of {len(residuals)}"
-    figure, axes = open_list(title, _row_names(calibration, rows))
+    repeated = any(r.cycle != 1 for r in residuals)
+    names = [f"{r.label}, cycle {r.cycle}" if repeated else r.label for r in rows]
+    figure, axes = open_list(title, names)
     y = np.arange(len(rows))
     before, after = (np.array([f(r) for r in rows]) / MM for f in (_deviation, _residual))
     sigma = np.array([calibration.row_sigma(r) for r in rows]) / MM
@@ -160,12 +160,6 @@ def _spread(calibration: Calibration) -> tuple[Array, str, list[tuple[float, str
 def _row_noun(calibration: Calibration) -> str:
     """Noun for a row: difference or reading."""
     return "difference" if calibration.rows_are_differences else "reading"
-
-
-def _row_names(calibration: Calibration, rows: Sequence[ResidualRow]) -> list[str]:
-    """Names of rows: setup, postures, and the cycle if there are several cycles."""
-    repeated = any(r.cycle != 1 for r in calibration.residuals)
-    return [f"{r.label}, cycle {r.cycle}" if repeated else r.label for r in rows]
 
 
 def _thin(count: int) -> NDArray[np.int64]:

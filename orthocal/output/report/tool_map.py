@@ -79,11 +79,11 @@ def _error_parts(accuracy: ToolAccuracy, which: Field) -> Array:
 
     They are averaged over the conditions of use.
     """
-    if which == "now":
-        return accuracy.average(accuracy.align(accuracy.deviation)) / UM
     after = accuracy.after
-    if which == "entered" or after is None:
-        return accuracy.average(accuracy.align(accuracy.deviation_with_entries)) / UM
+    if which != "uncertainty" or after is None:
+        now = which == "now"
+        deviation = accuracy.deviation if now else accuracy.deviation_with_entries
+        return accuracy.average(accuracy.align(deviation)) / UM
     variance = accuracy.average(np.trace(after.aligned_covariance, axis1=1, axis2=2))
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
 

@@ -129,9 +129,10 @@ def _front(
         rows.append((str(m.number), m.setup, measured, *gauge, count, *program))
     checks = checks_of_machine(session) if session.firmware is None else CHECKS_OF_PRINTER
     programs = with_programs and session.firmware is None
+    once = "temperature" not in needed_conditions(robot)  # otherwise with each reading
     blanks = "".join(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
-        for text in ("Date, name", *_asked_once(session))
+        for text in ("Date, name", *(["Temperature at the start, at the end"] if once else []))
     )
     with_bar = any(isinstance(s.sensor, BallBar) for s in session.setups.values())
     return (
@@ -237,13 +238,6 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         body += f'<tr>{"".join(cells)}{box}<td class="note">{remark}</td></tr>'
     kind = "boxes wide" if approaches or to_note else "boxes"
     return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-
-
-def _asked_once(session: Session) -> tuple[str, ...]:
-    """Conditions that the operator writes down at the start and at the end of the session."""
-    if "temperature" in needed_conditions(session.robot):
-        return ()
-    return ("Temperature at the start, at the end",)
 
 
 def _asked_for_each(session: Session) -> tuple[str, ...]:
