@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
     from orthocal.robot.model import Drive
 
-FILES = ("session.yaml", "readings.csv", "sheet.html")
-
 
 @command()
 def again(
@@ -62,7 +60,7 @@ def again(
     from orthocal.export.formats import note_wrong_order, require_entering, require_offsets
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
-    require_new_session(out, FILES, force=force)
+    require_new_session(out, ("session.yaml", "readings.csv", "sheet.html"), force=force)
     result = orthocal.load_calibration(calibration)
     require_offsets(result, where=str(calibration))
     if not anyway:

@@ -11,8 +11,6 @@ from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
 from orthocal.text import quote_path
 
-FILES = ("session.yaml", "readings.csv", "truth.yaml")
-
 
 @command()
 def simulate(
@@ -47,7 +45,7 @@ def simulate(
     from orthocal.observation.simulate import collect_errors, drawn_gauge_errors, truth_document
     from orthocal.session.points import count_readings
 
-    require_new_session(out, FILES, force=force)
+    require_new_session(out, ("session.yaml", "readings.csv", "truth.yaml"), force=force)
     planned = load_stated_plan(plan, effects=effects, temperature=temperature)
     planned = state_tolerances(planned, tolerance)
     true_errors = collect_errors(

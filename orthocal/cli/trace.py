@@ -9,8 +9,6 @@ from orthocal.cli.options import OutDirectory, command, read_pairs
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
 
-FILES = ("session.yaml", "readings.csv")
-
 
 @command()
 def trace(plan: Path, traces: list[str], out: OutDirectory, force: bool = False) -> None:
@@ -33,7 +31,7 @@ def trace(plan: Path, traces: list[str], out: OutDirectory, force: bool = False)
     )
     from orthocal.session.points import count_readings
 
-    require_new_session(out, FILES, force=force)
+    require_new_session(out, ("session.yaml", "readings.csv"), force=force)
     session = load_plan(plan)
     files = read_pairs(traces, "traces", "SETUP=FILE")
     by_setup = {name: read_trace(path, session.robot) for name, path in files.items()}

@@ -58,16 +58,11 @@ def view(
     if png is not None:
         put_note(f"Wrote {take_picture(scene.to_html(), png, width=width, height=height)}")
     if html is None and png is None:
-        _serve(scene, port, browse=open_)
+        with orthocal.LiveScene(scene, port=port) as live:
+            put_out(live.url)
+            put_note("Open this in a browser on this machine; Ctrl-C ends.")
+            if open_:
+                import webbrowser
 
-
-def _serve(scene: orthocal.Scene, port: int | None, *, browse: bool) -> None:
-    """Serve a scene until Ctrl-C."""
-    with orthocal.LiveScene(scene, port=port) as live:
-        put_out(live.url)
-        put_note("Open this in a browser on this machine; Ctrl-C ends.")
-        if browse:
-            import webbrowser
-
-            webbrowser.open(live.url)
-        live.wait()
+                webbrowser.open(live.url)
+            live.wait()

@@ -46,6 +46,7 @@ from orthocal.output.text.answer import (
 )
 from orthocal.output.text.layout import to_markup
 from orthocal.output.text.tables import (
+    describe_change,
     render_findings,
     render_fit,
     render_identifiability,
@@ -152,7 +153,7 @@ def write_report(calibration: Calibration, path: str | Path) -> Path:
 def _verdict(calibration: Calibration, saved: Path | None, further: FurtherHour) -> str:
     """Content of the section with the verdict, the values to enter and the findings."""
     before, after = calibration.rms_before, calibration.rms_after
-    change = f" ({after / before - 1.0:+.0%})" if before > 1e-8 else ""
+    change = f" ({percent})" if (percent := describe_change(before, after)) else ""
     fit = (
         f"Deviations of the readings: {mm(before)} mm RMS before, {mm(after)} mm after "
         f"calibration{change}; largest {mm(calibration.largest_before)} mm before, "

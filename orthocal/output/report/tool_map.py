@@ -32,8 +32,6 @@ TITLES: dict[Field, str] = {
     "uncertainty": "Uncertainty of the tool error, RMS, workpiece aligned",
 }
 
-AVERAGED = ", mean over conditions"
-
 NEGLIGIBLE = 1e-3
 """Errors and differences of errors up to this count as zero, [µm]."""
 
@@ -123,7 +121,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
         interpolate = _interpolate(sides, _cut(grid, plane))
         maps.append((plane, sides, interpolate, *_refine(sides, interpolate)))
     levels = _choose_levels(np.concatenate([size.reshape(-1) for *_, size in maps]))
-    title = TITLES[which] + (AVERAGED if accuracy.use.size > 1 else "")
+    title = TITLES[which] + (", mean over conditions" if accuracy.use.size > 1 else "")
     figure = open_figure(3.0 if len(planes) > 1 else 5.0, title, legend=False)
     panels = np.atleast_1d(figure.subplots(1, len(planes)))
     for axes, (plane, sides, interpolate, x, y, size) in zip(panels, maps, strict=True):

@@ -28,7 +28,12 @@ from orthocal.output.scene.deviations import (
     measurement_of_session,
     plan_stops,
 )
-from orthocal.output.scene.readings import draw_readings, write_headline, write_steps
+from orthocal.output.scene.readings import (
+    NEGLIGIBLE,
+    draw_readings,
+    write_headline,
+    write_steps,
+)
 from orthocal.output.scene.tool_errors import draw_tool_errors
 from orthocal.output.text.layout import typeset
 from orthocal.robot.model import Robot, coordinate_units, name_coordinates
@@ -53,9 +58,6 @@ DEFAULT_DEVIATION = 0.05
 
 MAX_DEVIATION = 1.0
 """Largest drawn size of the largest deviation, relative to the machine."""
-
-NEGLIGIBLE = 1e-9
-"""Deviations below this are zero, [m]."""
 
 UNLIMITED_TRAVEL = 0.3
 """Drawn travel of a drive without limits, [rad] or characteristic lengths."""

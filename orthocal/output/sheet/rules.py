@@ -39,18 +39,6 @@ CHECKS_OF_PRINTER = [
 ]
 """Checks of a printer."""
 
-LINES_APPROACH = (
-    "Send all lines of a reading in their order: the last one approaches the posture from the "
-    "right side."
-)
-"""Rule for the approach of postures on a printer."""
-
-PROBED_BY_HAND = (
-    f"The lines of a probe stop {PROBING_DISTANCE / MM:g} mm before the posture. Then move the "
-    "probe towards the surface until it triggers."
-)
-"""The same for postures that are probed."""
-
 BY_EYE = 0.01
 """Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
 
@@ -220,7 +208,14 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     guided = [n for n, s in session.setups.items() if tool_path(s.sensor) is not None]
     probed = [n for n, s in session.setups.items() if probing_direction(s.sensor) is not None]
     if session.firmware is not None:
-        return " ".join([LINES_APPROACH, *[PROBED_BY_HAND] * bool(probed)])
+        by_hand = (
+            f" The lines of a probe stop {PROBING_DISTANCE / MM:g} mm before the posture. Then "
+            "move the probe towards the surface until it triggers."
+        )
+        return (
+            "Send all lines of a reading in their order: the last one approaches the posture from "
+            f"the right side.{by_hand * bool(probed)}"
+        )
     motions = [m for m in motions if m.setup not in probed]
     others = [PROBING] if probed else []
     if guided and not any(r.approach for r in session.readings if r.setup in guided):

@@ -17,23 +17,6 @@ from orthocal.sensors.protocol import has_dial, mounting_steps, probing_directio
 from orthocal.session.session import Session, Setup
 from orthocal.units import MM
 
-END = (
-    "Compare the last reading with {}: posture and approach are the same. If they differ by more "
-    "than {}, read this setup again: the gauge or the machine was displaced. "
-)
-"""Check after the readings of a setup: the first reading, and the largest usual difference."""
-
-FROM_ANOTHER_SIDE = (
-    "The last reading repeats the first posture from another side: backlash may change it. "
-)
-"""The same where the closing reading has another approach than the first."""
-
-END_OF_POINTS = (
-    "Compare the points of the first posture with each other. If they differ by more than the "
-    "instrument scatters, read this setup again: the instrument or the machine was displaced. "
-)
-"""The same for points."""
-
 VISIBLE = 5e-5
 """Smallest distance that the sheet mentions and smallest deflection that a dial shows, [m]."""
 
@@ -42,16 +25,25 @@ def compare_closing(session: Session, motion: SetupMotion) -> str:
     """Check after the readings of a setup."""
     setup = session.setups[motion.setup]
     if isinstance(setup.sensor, Points):
-        return END_OF_POINTS
+        return (
+            "Compare the points of the first posture with each other. If they differ by more than "
+            "the instrument scatters, read this setup again: the instrument or the machine was "
+            "displaced. "
+        )
     first, last = motion.stops[0], motion.stops[-1]
     if last is first or last.posture != first.posture:
         return ""
     if last.repeats is None or last.approach != first.approach:
-        return FROM_ANOTHER_SIDE
+        return (
+            "The last reading repeats the first posture from another side: backlash may change it. "
+        )
     largest = usual_difference(session.gauges[setup.gauge])
+    usual = f"{show_length(largest)} mm" if largest else "three steps of the dial"
     reading = "0" if first.role == "subtracted" else f"that of line {last.repeats}"
-    return END.format(
-        reading, f"{show_length(largest)} mm" if largest else "three steps of the dial"
+    return (
+        f"Compare the last reading with {reading}: posture and approach are the same. If they "
+        f"differ by more than {usual}, read this setup again: the gauge or the machine was "
+        "displaced. "
     )
 
 

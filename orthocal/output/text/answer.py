@@ -51,9 +51,6 @@ from orthocal.units import DRIVE_UNITS, show_limit, tidy
 NEXT_NAMES = dict(pairwise(("first", "second", "third", "fourth", "fifth", "sixth")))
 """Directory of a session, mapped to that of the next one."""
 
-UNCHANGED = "unchanged"
-"""Backlash of the controller that keeps its value."""
-
 MOST_LISTED = 4
 """Further findings that the short answer lists."""
 
@@ -466,7 +463,7 @@ def render_backlash(calibration: Calibration) -> RenderableType:
         known |= is_known or bool(e.change)
         limited = readings_limit(calibration, f"{e.drive}.backlash")
         small &= limited
-        keep = UNCHANGED if limited else "not determined"
+        keep = "unchanged" if limited else "not determined"
         enter = plain(e.enter * factor) if e.change else keep
         rows.append((e.drive, plain(e.active * factor), enter, half, e.edge_unit))
         largest[e.edge_unit] = max(uncertainty * factor, largest.get(e.edge_unit, 0.0))

@@ -21,9 +21,6 @@ from orthocal.printers.settings import DeltaSettings
 from orthocal.text import list_some, quote_path, spans
 from orthocal.units import DEG, MM, to_mm
 
-UNIT_SYMBOLS = {"um": "µm"}
-"""Symbols of units that have another symbol than their name."""
-
 CHANGES = {
     "filled": "filled in",
     "added": "added",
@@ -61,7 +58,7 @@ def _interpretation(result: TableImport) -> list[tuple[str, str]]:
         ]
     items.append(("decimal sign", _describe_decimal_sign(result)))
     reason = "requested" if long_table.unit_assumed else "stated in the table"
-    units = ", ".join(UNIT_SYMBOLS.get(unit, unit) for unit in long_table.units)
+    units = ", ".join("µm" if unit == "um" else unit for unit in long_table.units)
     items.append(("unit", f"{units} ({reason})"))
     items += _columns_by_role(result)
     if result.columns.extra:

@@ -71,8 +71,6 @@ SOME_LOST = 0.01
 MOST_LISTED = 24
 """Largest number of setups that are listed one by one."""
 
-EVENLY = "evenly spaced"
-
 KNOWN_ZERO = {BallBar.kind: "the ball bar", Probe.kind: "the probe"}
 """Sensors whose zero is known, with their nouns."""
 
@@ -104,8 +102,6 @@ HOW_TO = {
     ),
 }
 """Instructions for the kinds of sensor of a plan, with what moves the machine."""
-
-OUT_OF_RANGE = "beyond the dial's range"
 
 
 def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType:
@@ -419,8 +415,10 @@ def _alternatives(plan: MeasuringPlan) -> RenderableType:
     this = Alternative("this plan", setups, first + closing, plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.usual_plans):
-        error = OUT_OF_RANGE if a.expected is None else um(a.expected.reported.rms)
-        name = EVENLY if a.name == "even" else a.name
+        error = "beyond the dial's range"
+        if a.expected is not None:
+            error = um(a.expected.reported.rms)
+        name = "evenly spaced" if a.name == "even" else a.name
         rows.append((name, str(a.setups), str(a.readings), show_duration(a.minutes), error))
     headers = ("plan", "setups", "readings", "time", "tool error [µm]")
     return table_of(headers, rows)

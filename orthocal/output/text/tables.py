@@ -231,16 +231,19 @@ def _ratio(value: float, std: float) -> str:
     return f"{value / std:+.1f}" if std > 0.0 else ""
 
 
+def describe_change(before: float, after: float) -> str:
+    """Relative change by the calibration, such as "-93%"; "" for negligible deviations, [m]."""
+    return f"{after / before - 1.0:+.0%}" if before > NOTHING else ""
+
+
 def render_fit(calibration: Calibration) -> RenderableType:
     """RMS and largest deviation before and after calibration, and the noise."""
     c, noise = calibration, calibration.noise
-    rows = []
-    for name, before, after in (
-        ("RMS [mm]", c.rms_before, c.rms_after),
-        ("largest [mm]", c.largest_before, c.largest_after),
-    ):
-        change = f"{after / before - 1.0:+.0%}" if before > NOTHING else ""
-        rows.append((name, mm(before), mm(after), change))
+    sizes = {
+        "RMS [mm]": (c.rms_before, c.rms_after),
+        "largest [mm]": (c.largest_before, c.largest_after),
+    }
+    rows = [(name, *map(mm, ends), describe_change(*ends)) for name, ends in sizes.items()]
     table = table_of(("", "before", "after", ""), rows)
     if len(c.gauges) > 1:
         return noted(table, *(f"σ of {g.name}: {mm(g.noise.sigma)} mm" for g in c.gauges))

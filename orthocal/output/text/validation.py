@@ -47,12 +47,6 @@ EXPECTED_NOTE = (
 )
 """Meaning of the column `expected`, and why the limit can be smaller."""
 
-FROM_ELSEWHERE = (
-    ", validate in the directory in which the calibration was made: its sessions are not found "
-    "from here."
-)
-"""End of a sentence in place of a command."""
-
 MORE = "--details prints deviations and all readings."
 
 
@@ -129,7 +123,11 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
     stated = validation.final_calibration.robot.parameters.stated
     sessions = [Path(path).parent for path in paths if path is not None]
     if not all(exists(path) for path in sessions):  # recorded as seen from another directory
-        return [Text(), render_next(f"{words.removesuffix(':')}{FROM_ELSEWHERE}")]
+        text = (
+            f"{words.removesuffix(':')}, validate in the directory in which the calibration was "
+            "made: its sessions are not found from here."
+        )
+        return [Text(), render_next(text)]
     command = calibrate_command(sessions, stated, calibration=validation.final_calibration)
     return [Text(), render_next(words, [command])]
 
