@@ -154,8 +154,7 @@ def _list_parameters(source: Callable[..., Any]) -> list[inspect.Parameter]:
         if is_dataclass(hint):
             parameters += _list_parameters(cast("type", hint))
             continue
-        if parameter.name in described:
-            hint = _describe(parameter, hint, *described[parameter.name])
+        hint = _describe(parameter, hint, *described.get(parameter.name, ("", "")))
         parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
     return parameters
 
@@ -175,7 +174,8 @@ def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str)
         kind, info = hint, Argument()
     else:  # a stated name: a flag has no negative form
         kind, info = hint, Option(f"--{parameter.name.strip('_').replace('_', '-')}")
-    info.metavar, info.help = metavar or None, " ".join(words.split())
+    if words:
+        info.metavar, info.help = metavar or None, " ".join(words.split())
     return Annotated[kind, info]
 
 
