@@ -191,6 +191,8 @@ class SharedOptions:
     Args:
         sessions (SESSION...): session.yaml, or the directory that contains it; several are
             calibrated together.
+        subject (ROBOT|SESSION): An Orthoglide-type robot, measured by the paper's plan; or a
+            session.
         plan (PLAN): session.yaml of a plan or a session, or its directory.
         calibration (CALIBRATION): calibration.json, or the directory that contains it.
         model (MODEL): Errors to identify: full (the complete machine), offsets, lengths or another

@@ -50,13 +50,7 @@ PROGRESS_STEP = 0.1
 
 Count = Annotated[int, Option(min=2, max=1_000_000)]
 Size = Annotated[int, Option(min=1, max=10_000)]
-Subject = Annotated[
-    str,
-    Argument(
-        metavar="ROBOT|SESSION",
-        help="An Orthoglide-type robot, measured by the paper's plan; or a session.",
-    ),
-]
+Subject = Annotated[str, Argument()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,7 +36,7 @@ from orthocal.output.text.answer import (
     render_answer,
 )
 from orthocal.output.text.layout import to_text
-from orthocal.output.text.summary import render_calibration
+from orthocal.output.text.summary import render_result
 from orthocal.output.text.tables import RECOMMENDING
 from orthocal.statistics.chance import coverage_factor
 
@@ -131,7 +131,7 @@ def test_an_answer_is_short_in_order_and_states_all_that_decides(answers, name):
 def assert_short(calibration):
     """In plain words, whatever the width of the terminal."""
     for width in (80, 100):
-        text = to_text(render_calibration(calibration), width=width)
+        text = to_text(render_result(calibration), width=width)
         assert len(text.splitlines()) <= MOST_LINES
         assert max(len(line) for line in text.splitlines()) <= width
         for word in NOT_SAID:
@@ -258,7 +258,7 @@ def test_long_names_and_paths_leave_it_short(answers):
     setups = tuple(replace(s, name=f"{s.name}-{long[:40]}") for s in calibration.setups)
     session = replace(calibration.session, title=long * 3, readings_path=f"/{long}/readings.csv")
     text = to_text(
-        render_calibration(replace(calibration, session=session, residuals=rows, setups=setups)),
+        render_result(replace(calibration, session=session, residuals=rows, setups=setups)),
         width=80,
     )
     assert len(text.splitlines()) <= MOST_LINES

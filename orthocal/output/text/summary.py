@@ -59,7 +59,9 @@ def render_result(
         saved: Directory in which a calibration was written.
     """
     if isinstance(result, Calibration):
-        return render_calibration(result, details=details, all_rows=all_rows, saved=saved)
+        if not (details or all_rows):
+            return Group(render_answer(result, saved=saved), Text(MORE))
+        return _complete(result, saved, all_rows=all_rows)
     from orthocal.assessment.comparison import Comparison
     from orthocal.assessment.validation import Validation
     from orthocal.planning.plan import MeasuringPlan
@@ -85,16 +87,8 @@ def render_result(
     return render_validation(result, details=details, all_rows=all_rows)
 
 
-def render_calibration(
-    calibration: Calibration,
-    *,
-    details: bool = False,
-    all_rows: bool = False,
-    saved: Path | None = None,
-) -> RenderableType:
-    """A calibration as rich renderables: the short answer, and on demand the details."""
-    if not (details or all_rows):
-        return Group(render_answer(calibration, saved=saved), Text(MORE))
+def _complete(calibration: Calibration, saved: Path | None, *, all_rows: bool) -> RenderableType:
+    """The short answer of a calibration, and its details."""
     from orthocal.output.text import tables
     from orthocal.output.text.accuracy import expect_further_hour, render_tool
 
