@@ -45,7 +45,6 @@ def accuracy(
     Args:
         points (TARGETS.csv): Columns of the tool: x_mm, y_mm, z_mm.
     """
-    from orthocal.assessment.tool_error import MOST_POINTS
     from orthocal.export.formats import require_entering
     from orthocal.kinematics.workspace import cube
     from orthocal.measurement.files.coordinate_tables import read_points
@@ -65,12 +64,7 @@ def accuracy(
         if not json:
             _print_points(result, targets, names, conditions, calibration)
             return
-        if len(targets) > MOST_POINTS:
-            raise SessionError(
-                f"contains {len(targets)} points; expected at most {MOST_POINTS} with --json, "
-                "which evaluates all together",
-                where=str(points),
-            )
+        _require_few(targets, points)
         workspace = orthocal.Workspace.even(targets)
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * MM)
@@ -112,6 +106,22 @@ def _print_points(
         put_note(note)
         raise
     put_note(note)
+
+
+def _require_few(targets: Array, path: Path) -> None:
+    """Refuse too many points for an evaluation in one block.
+
+    Raises:
+        SessionError: If there are too many points; names their file.
+    """
+    from orthocal.assessment.tool_error import MOST_POINTS
+
+    if len(targets) > MOST_POINTS:
+        raise SessionError(
+            f"contains {len(targets)} points; expected at most {MOST_POINTS} with --json, "
+            "which evaluates all together",
+            where=str(path),
+        )
 
 
 def _out_of_reach(

@@ -64,9 +64,7 @@ def import_(
         settings (FILE): Settings that a log lacks, such as printer.cfg, config.g or bed.g.
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
-    from orthocal.measurement.importing.printer_log import recognise_log
-
-    if format or settings or radius_mm is not None or recognise_log(table) is not None:
+    if format or settings or radius_mm is not None or _is_printer_log(table):
         _refuse_options(sheet, decimal, separator, unit, encoding, column, fill, replace)
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
@@ -117,6 +115,13 @@ def _refuse_options(*values: object) -> None:
 
 def _session_file(session: Path) -> Path:
     return session / "session.yaml" if session.suffix not in (".yaml", ".yml") else session
+
+
+def _is_printer_log(table: Path) -> bool:
+    """True if the file is clearly a printer's log."""
+    from orthocal.measurement.importing.printer_log import recognise_log
+
+    return recognise_log(table) is not None
 
 
 def _require_session(table: Path, session: Path) -> None:

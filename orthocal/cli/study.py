@@ -177,8 +177,6 @@ def linearisation(
     from orthocal.planning.first_plan import PAPER_GAUGE
 
     require_between(largest_mm, 0.0, LARGEST_MM, "--largest-mm")
-    if along is not None and directions is not None:
-        raise ParameterError("cannot be combined with --along", where="--directions")
     displacements = _read_displacements(leg_mm, max_mm, min_mm)
     for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
         if value is not None:
@@ -194,7 +192,7 @@ def linearisation(
             largest=largest_mm,
             count=sizes,
             directions=directions or 25,
-            along=None if along is None else read_numbers(along, "--along"),
+            along=_read_along(along, directions),
             displacements=displacements,
             gauge=orthocal.Gauge(
                 gauge.sigma if sigma_mm is None else sigma_mm * MM,
@@ -204,6 +202,15 @@ def linearisation(
             seed=seed,
         )
     _run(study, RunOptions(workers=workers, dask=dask, out=out, json=json, force=force))
+
+
+def _read_along(along: str | None, directions: int | None) -> Sequence[float] | None:
+    """The stated direction of the errors; None for random ones."""
+    if along is None:
+        return None
+    if directions is not None:
+        raise ParameterError("cannot be combined with --along", where="--directions")
+    return read_numbers(along, "--along")
 
 
 def _read_displacements(
