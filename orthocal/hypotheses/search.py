@@ -85,7 +85,7 @@ def find_anomalies(session: Session) -> Anomalies:
     """
     linear = linear_model(session)
     if len(session.readings) < 2 or linear.dof < 1:
-        return Anomalies((), 0.0, True, 0.0, 0.0, 1.0, 1.0)
+        return Anomalies((), True, 0.0, 0.0, 1.0)
     return _Search(session, linear).run()
 
 
@@ -371,12 +371,10 @@ class _Search:
         explained = any(t.silent is not None for t in state.terms) or self.is_plausible(state)
         return Anomalies(
             tuple(anomalies),
-            state.log_posterior - sound.log_posterior,
             explained,
             self.model.rms(sound.remaining, sound.about),
             self.model.rms(state.remaining, state.about),
             state.score.tolerance_scale,
-            state.score.noise_scale,
             () if explained or not state.terms else self.suspected_rows(state),
             state.log_posterior,
         )

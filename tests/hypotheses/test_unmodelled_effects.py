@@ -55,7 +55,7 @@ def test_backlash_is_named_with_its_drive_amount_and_option(with_backlash):
     judgement = judge_session(with_backlash)
     (found,) = judgement.anomalies
     e = found.explanation
-    assert (e.kind, found.ambiguous) == ("backlash", False)
+    assert (e.kind, found.alternatives) == ("backlash", ())
     amounts = dict(zip(e.parameters, zip(e.amounts, e.stds, strict=True), strict=True))
     value, std = amounts["y_slide.backlash"]
     assert value == pytest.approx(50e-6, abs=3.0 * std)
@@ -139,7 +139,7 @@ def test_an_effect_of_another_package_is_named_by_its_description(slack):
     judgement = judge_session(session)
     (found,) = judgement.anomalies
     e = found.explanation
-    assert (e.kind, e.effect, found.ambiguous) == ("other effect", "slack", False)
+    assert (e.kind, e.effect, found.alternatives) == ("other effect", "slack", ())
     for name, amount, std in zip(e.parameters, e.amounts, e.stds, strict=True):
         assert amount == pytest.approx(LOOSE.get(name, 0.0), abs=3.0 * std)
     assert dict(zip(e.parameters, e.stds, strict=True))["x_slide.slack"] < 4e-6
