@@ -166,7 +166,7 @@ class SystematicEffect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Family:
-    """Hypotheses of one kind, which share a prior probability equally.
+    """Hypotheses of one kind, which share a prior probability equally; there may be none.
 
     Each hypothesis is one of these:
 

@@ -82,7 +82,7 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
     """
     for effect in effects:
         if effect.name == "drift":
-            yield from _drifts(rows, effect)
+            yield _drifts(rows, effect)
         concerned = np.flatnonzero(effect.change.astype(bool) | effect.columns.any(axis=0))
         setups = tuple(dict.fromkeys(rows.session.readings[i].setup for i in concerned))
         kind = EFFECT_KINDS.get(effect.name, "other effect")
@@ -90,7 +90,7 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
         yield Family.of([e], systematic=[effect])
 
 
-def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
+def _drifts(rows: Rows, effect: SystematicEffect) -> Family:
     """Drift of each setup by an unknown amount, and one common drift of all setups."""
     session, explanations, ramps = rows.session, [], []
     of_setup = group_rows(r.setup for r in session.readings)
@@ -107,5 +107,4 @@ def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
         names = tuple(e.setups[0] for e in explanations)
         explanations.append(Explanation("drift", "session", concerned, names))
         ramps.append(np.concatenate(ramps))
-    if explanations:
-        yield Family.with_effects(rows, explanations, ramps)
+    return Family.with_effects(rows, explanations, ramps)

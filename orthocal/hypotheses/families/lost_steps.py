@@ -57,9 +57,8 @@ def lost_steps(model: LinearModel, rows: Rows) -> Iterator[Family]:
                     )
                 )
                 shifts.append(MachineShift(entries, direction))
-    if explanations:
-        rarity = np.full(len(shifts), LOG_PROBABILITY)
-        yield Family.of(explanations, shifts=shifts, known=False, log_volume=rarity)
+    rarity = np.full(len(shifts), LOG_PROBABILITY)
+    yield Family.of(explanations, shifts=shifts, known=False, log_volume=rarity)
 
 
 def _first_readings(rows: Indices, size: int) -> Indices:

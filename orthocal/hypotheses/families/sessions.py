@@ -48,7 +48,7 @@ def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
 def _of_controller(
     model: LinearModel, parameter: str, stated: Array, enter: Enter
 ) -> Iterator[Family]:
-    """Numbers of a session that were entered wrongly, each mistake once; none without a mistake.
+    """Numbers of a session that were entered wrongly, each mistake once.
 
     Args:
         model: The linearised model.
@@ -78,8 +78,7 @@ def _of_controller(
             direction = np.zeros(model.problem.n_free)
             direction[place] = (stated[k] - active) / model.problem.theta_scale[place]
             shifts.append(MachineShift(model.session_of_entry == k, direction))
-    if explanations:
-        yield Family.of(explanations, shifts=shifts)
+    yield Family.of(explanations, shifts=shifts)
 
 
 def enter_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
@@ -164,8 +163,7 @@ def _changed(model: LinearModel) -> Iterator[Family]:
                 direction[place[term]] = coefficient / problem.theta_scale[place[term]]
             of_others.append((p.name, direction))
     for directions in (of_offsets, of_others):
-        if directions:
-            yield _steps(model, directions, drive_of, place)
+        yield _steps(model, directions, drive_of, place)
 
 
 def _steps(
