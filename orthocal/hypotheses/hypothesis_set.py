@@ -44,6 +44,11 @@ class Term:
     unit: float = 1.0
     """Unit of the amount of a single effect: the noise of its gauge relative to the first one."""
 
+    @property
+    def unknown_shift(self) -> MachineShift | None:
+        """Machine shift of unknown amount; None without one."""
+        return None if self.known else self.shift
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HypothesisSet:
@@ -84,7 +89,7 @@ class HypothesisSet:
         return all(
             abs(a[0]) > LIMIT * std[0]
             for t, a, std in zip(self.terms, self.amounts, self.stds, strict=True)
-            if t.shift is not None and not t.known
+            if t.unknown_shift is not None
         )
 
 
@@ -110,8 +115,7 @@ def split_amounts(terms: Sequence[Term], amounts: Array) -> tuple[Array, ...]:
         amounts: Amounts of all effects and unknown shifts, then of all silent rows, shape (k,).
     """
     sizes = [
-        len(t.effects) if t.effects is not None else int(t.shift is not None and not t.known)
-        for t in terms
+        len(t.effects) if t.effects is not None else int(t.unknown_shift is not None) for t in terms
     ]
     silent = [0 if t.silent is None else len(t.silent) for t in terms]
     effect_ends, silent_ends = np.cumsum([0, *sizes]), np.cumsum([sum(sizes), *silent])
@@ -139,7 +143,7 @@ def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
         single = term.effects is not None and len(term.effects) == 1 and e.kind != "row offset"
         if term.systematic is not None:
             e = _with_parameters(e, term.systematic, amounts, stds)
-        elif single or (term.shift is not None and not term.known):
+        elif single or term.unknown_shift is not None:
             e = replace(e, amount=float(amounts[0] * unit), std=float(stds[0] * unit))
         explanations.append(e)
     return explanations

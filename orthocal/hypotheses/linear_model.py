@@ -118,6 +118,7 @@ class LinearModel:
                 self.reference[self.problem.free.index(name)] = backlash
         self._shares = zero_shares(o)
         self._incidence = self.problem.zero_incidence
+        self._references: dict[bool, ModelLinearisation] = {}
 
     def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
         """Linearisation about the machine without errors; raises as `linearise` does.
@@ -125,15 +126,9 @@ class LinearModel:
         Some nuisance parameters change readings noticeably, but only to second order, such as the
         height of a fixed ball across the plane of motion. They are one standard deviation there.
         """
-        return self._reference_with_jacobian if keep_jacobian else self._reference
-
-    @cached_property
-    def _reference(self) -> ModelLinearisation:
-        return self._linearise_reference(keep_jacobian=False)
-
-    @cached_property
-    def _reference_with_jacobian(self) -> ModelLinearisation:
-        return self._linearise_reference(keep_jacobian=True)
+        if keep_jacobian not in self._references:
+            self._references[keep_jacobian] = self._linearise_reference(keep_jacobian=keep_jacobian)
+        return self._references[keep_jacobian]
 
     def _linearise_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
         """Linearisation about the machine without errors."""
@@ -436,10 +431,8 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         model = self._without_noise_of(row)
-        if model is not self:
-            return model.predict_row(rows, row)
-        entries, effect = self.entries(np.array([rows, np.arange(rows.size) == row]))
-        about = self.approach(entries, effect)
+        entries, effect = model.entries(np.array([rows, np.arange(rows.size) == row]))
+        about = model.approach(entries, effect)
         (amount,), (std,) = about.likelihood.estimate_amounts(
             entries - about.expected, effect[None]
         )
@@ -461,17 +454,15 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         model = self._without_noise_of(row)
-        if model is not self:
-            return model.compare_row(rows, row)
-        mean, std = self.predict_row(rows, row)
+        mean, std = model.predict_row(rows, row)
         deviation = abs(rows[row] - mean)
         if not deviation > std:
             return mean, std
         with_mean = np.where(np.arange(rows.size) == row, mean, rows)
         misfits = []
         for values in (rows, with_mean):
-            (entries,) = self.entries(values[None])
-            about = self.approach(entries, np.zeros_like(entries))
+            (entries,) = model.entries(values[None])
+            about = model.approach(entries, np.zeros_like(entries))
             misfits.append(about.likelihood.misfit(entries - about.expected))
         increase = max(misfits[0] - misfits[1], 0.0)
         return mean, max(std, deviation / max(math.sqrt(increase), 1.0))
@@ -526,13 +517,9 @@ class LinearModel:
             return about.likelihood.misfit(deviation - amount * effect)
 
         best = self._descend(self.at_reference(keep_jacobian=False), entries, effect)
-        minima = [best]
-        for theta in self._mirrored(best):
-            try:
-                start = self.linearise(theta, (), best.passive, keep_jacobian=False)
-            except (ClosureError, SessionError, np.linalg.LinAlgError):
-                continue
-            minima.append(self._descend(start, entries, effect))
+        mirrored = [LinearisationPoint(t, (), best.passive) for t in self._mirrored(best)]
+        starts = self.linearise_all(mirrored, keep_jacobian=False)
+        minima = [best, *(self._descend(s, entries, effect) for s in starts if s is not None)]
         return min(minima, key=misfit)
 
     def _mirrored(self, about: ModelLinearisation) -> Array:
@@ -574,12 +561,10 @@ class LinearModel:
         """
         step = errors - about.theta
         for share in 0.5 ** np.arange(MAX_HALVINGS + 1):
-            try:
-                return self.linearise(
-                    about.theta + share * step, (), about.passive, keep_jacobian=False
-                )
-            except (ClosureError, SessionError, np.linalg.LinAlgError):
-                continue
+            point = LinearisationPoint(about.theta + share * step, (), about.passive)
+            (nearer,) = self.linearise_all([point], keep_jacobian=False)
+            if nearer is not None:
+                return nearer
         return None
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
