@@ -88,17 +88,12 @@ class CalibratedTool:
 
     def deviation_ignoring_conditions(self) -> Array:
         """Tool error if all errors are corrected for `UseConditions()`, shape (C K, 3), [m]."""
-        closure, points = self.closure_of_reference, self.workspace.points[: len(self.drives)]
-        commanded, passive = closure.reach(points)
-        reached = closure.tcp(commanded, passive)
+        closure = self.sensitivities[0].closure
+        reference = LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
+        commanded, passive = reference.reach(self.workspace.points[: len(self.drives)])
+        reached = reference.tcp(commanded, passive)
         commanded = commanded + self.trims - self.trims_unstated
         return self._place(commanded, None) - np.tile(reached, (self.use.size, 1))
-
-    @property
-    def closure_of_reference(self) -> LoopClosure:
-        """Closures of the machine under the reference conditions, `UseConditions()`."""
-        closure = self.sensitivities[0].closure
-        return LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
 
     def _place(self, commanded: Array, names: Sequence[str] | None) -> Array:
         """Tool positions under each of the conditions, shape (C K, 3), [m].
