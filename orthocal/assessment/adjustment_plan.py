@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -395,9 +395,7 @@ class _Search:
         """
         if not chosen:
             return ()
-        uncertainty: Mapping[int, float] = dict(
-            zip(chosen, self.uncertainties(chosen).tolist(), strict=True)
-        )
+        uncertainty = dict(zip(chosen, self.uncertainties(chosen).tolist(), strict=True))
         pending = [i for i in chosen if amounts[i] != 0.0]
         amounts_set, planned, shown = np.zeros_like(amounts), [], before
         while pending:

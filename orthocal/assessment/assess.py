@@ -425,14 +425,12 @@ def _decide(
     headlines = words.FIRMWARE_HEADLINES if firmware else words.HEADLINES
     if verdict != "enter":
         return Decision(verdict, headlines[verdict], lead.text, describe_actions(findings))
-    for kind, headline in KEEPING.items():
-        finding = first_of(findings, kind)
-        if finding is not None and firmware:
-            return Decision(verdict, words.FIRMWARE_KEEP_HEADLINE, finding.text, finding.action)
-        if finding is not None:
-            if backlash:
-                headline = f"{headline} {words.BACKLASH_HEADLINE}"
-            return Decision(verdict, headline, finding.text, finding.action)
+    kept = next(filter(None, (first_of(findings, kind) for kind in KEEPING)), None)
+    if kept is not None:
+        headline = words.FIRMWARE_KEEP_HEADLINE if firmware else KEEPING[kept.kind]
+        if backlash and not firmware:
+            headline = f"{headline} {words.BACKLASH_HEADLINE}"
+        return Decision(verdict, headline, kept.text, kept.action)
     explanation = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if explanation is None else (explanation.text, explanation.action)
     if firmware:

@@ -90,16 +90,6 @@ class Judgement:
         """Verdict of the gravest finding."""
         return verdict_of(self.findings)
 
-    def require_of(self, session: Session) -> None:
-        """Refuse to use the judgement for other readings.
-
-        Raises:
-            ValueError: If the session has other readings.
-        """
-        values = self.values
-        if values is not None and not np.array_equal(values, session.values, equal_nan=True):
-            raise ValueError("judgement: found one of other readings; expected that of the session")
-
 
 def judgement_of(session: Session, judgement: Judgement | None) -> Judgement:
     """Judgement of a session: the one that was computed already, or a new one.
@@ -112,7 +102,9 @@ def judgement_of(session: Session, judgement: Judgement | None) -> Judgement:
     if judgement is None:
         return judge_session(session)
     require_kind(judgement, Judgement, expected="a Judgement, as judge_session returns")
-    judgement.require_of(session)
+    values = judgement.values
+    if values is not None and not np.array_equal(values, session.values, equal_nan=True):
+        raise ValueError("judgement: found one of other readings; expected that of the session")
     return judgement
 
 
