@@ -10,10 +10,9 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
-from orthocal.hypotheses.families.lost_steps import lost_steps
 from orthocal.hypotheses.families.printer_settings import changes_between_logs
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
-from orthocal.hypotheses.families.sessions import changes_between_sessions
+from orthocal.hypotheses.families.sessions import changes_between_sessions, lost_steps
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.families.wrong_readings import wrong_readings
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, to_dense

@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array, Indices, Mask
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
@@ -25,6 +25,7 @@ from orthocal.hypotheses.hypothesis import (
     Patterns,
     Sparse,
     row_products,
+    sparse_rows,
 )
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
@@ -197,10 +198,6 @@ class LinearModel:
         several = len(self.labels) > 1 or bool(self.compensated.any())
         return several or (small and bool(self.offsets))
 
-    def entries_of(self, sessions: Mask) -> Mask:
-        """Mask of the entries of sessions, shape (n_entries,), from their mask, (n_sessions,)."""
-        return np.asarray(sessions[self.session_of_entry])
-
     @property
     def order(self) -> Indices:
         """Sessions in the order of measuring, shape (n_sessions,).
@@ -232,16 +229,11 @@ class LinearModel:
     @cached_property
     def to_entries(self) -> Sparse:
         """Entries per unit of each row, in units of the first gauge, (n_rows, n_entries)."""
-        o = self.problem.observations
-        n = o.plus.size
-        if n > MAX_DENSE_COLUMNS and self._has_single_readings:
-            from scipy.sparse import csr_array
-
-            return csr_array(
-                (1.0 / self.problem.noise_ratio[o.plus], (np.arange(n), o.plus)), (n, o.size)
-            )
-        matrix = np.array([o.values(row) / self.problem.noise_ratio for row in np.eye(n)])
-        if n <= MAX_DENSE_COLUMNS:
+        o, ratio = self.problem.observations, self.problem.noise_ratio
+        if self._has_single_readings:
+            return sparse_rows(list(o.plus[:, None]), list(1.0 / ratio[o.plus, None]), o.size)
+        matrix = np.array([o.values(row) / ratio for row in np.eye(o.plus.size)])
+        if len(matrix) <= MAX_DENSE_COLUMNS:
             return matrix
         from scipy.sparse import csr_array
 

@@ -21,7 +21,7 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.errors import RobotError
-from orthocal.hypotheses.families.effects import find_effects, missing_effects
+from orthocal.hypotheses.families.effects import find_effects, linearise_effect, missing_effects
 from orthocal.hypotheses.likelihood import (
     AmountPrior,
     _integrate_amounts,
@@ -29,7 +29,6 @@ from orthocal.hypotheses.likelihood import (
     log_of_sum,
 )
 from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.hypotheses.search import CLEAR_EFFECT_LOG_BAYES, find_anomalies
 from orthocal.statistics.distributions import log_positive_share
 

@@ -15,10 +15,11 @@ from orthocal.arrays import Indices
 from orthocal.effects.loading import measurable_effects, with_effects
 from orthocal.effects.registry import effect_names, find_effect, order_effects
 from orthocal.errors import RobotError
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import select_parameters
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, group_rows
 from orthocal.hypotheses.linear_model import CACHE_SIZE, LinearModel
-from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.observation.observations import readings_without
 from orthocal.session.session import Session
 
@@ -71,6 +72,38 @@ def find_effects(model: LinearModel) -> tuple[SystematicEffect, ...]:
         if visible.any():
             effects.append(effect.select(visible))
     return tuple(effects)
+
+
+def linearise_effect(model: LinearModel, name: str) -> SystematicEffect:
+    """Linearised change of the rows by an effect that the robot's model lacks.
+
+    The point of linearisation is the nominal machine.
+
+    Args:
+        model: The linearised model.
+        name: Name of the effect.
+
+    Raises:
+        RobotError: If the effect needs keys that the robot's YAML lacks.
+    """
+    session, o = model.problem.session, model.problem.observations
+    robot = session.robot
+    other = session.with_effects((*robot.effect_names, name))
+    parameters = other.robot.parameters
+    errors = [n for n in parameters.names if n not in robot.parameters]
+    offsets = [model.problem.free[i] for i in model.offsets.values()]
+    selection = select_parameters(parameters, free=[*offsets, *errors], prior=True)
+    problem = CalibrationProblem(other, selection)
+    reading, jacobian = problem.predict_and_jacobian(problem.active_theta)
+    nominal = model.problem.predict(model.problem.active_theta) * model.problem.noise_ratio
+    present = set(model.problem.free) | set(offsets)
+    new = [i for i, n in enumerate(problem.free) if n not in present]
+    return SystematicEffect(
+        name,
+        tuple(problem.parameters[i] for i in new),
+        o.rows(reading - nominal),
+        o.rows(jacobian[:, new]).T,
+    )
 
 
 def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Iterator[Family]:

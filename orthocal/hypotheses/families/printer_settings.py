@@ -20,10 +20,10 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
+from orthocal.hypotheses.families.artefacts import nuisance_columns
 from orthocal.hypotheses.families.sessions import divide_sessions
 from orthocal.hypotheses.hypothesis import Family, Patterns, sparse_rows
 from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.row_changes import nuisance_columns
 from orthocal.measurement.joining import settings_of_sessions
 from orthocal.observation.sensor_groups import fixed_parameters
 from orthocal.printers.settings import EQUAL, DeltaSettings

@@ -1,4 +1,4 @@
-"""Numbers of the controller that differ from the stated ones, and changes between joined sessions.
+"""Wrong numbers of the controller, lost steps, and changes of the machine between joined sessions.
 
 If a session states the offsets or backlashes E but its controller has C, its machine appears to
 have errors that differ by E − C.
@@ -6,19 +6,31 @@ have errors that differ by E − C.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations, permutations
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
+from orthocal.estimation.problem import CalibrationProblem
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
-from orthocal.hypotheses.hypothesis import Family, MachineShift
+from orthocal.hypotheses.hypothesis import Family, MachineShift, Rows
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.session.session import Session
 
 MAX_DRIVES = 6
 """Most drives of a robot of which all subsets are considered."""
+
+MIN_READINGS = 4
+"""Fewest readings of a session before and after a loss of steps; wrong readings explain fewer."""
+
+LOG_PROBABILITY_OF_LOSS = -3.0
+"""Logarithm of the prior probability of lost steps relative to other families. Drives lose steps
+more rarely than a gauge is displaced, which looks the same in the last setup."""
+
+MAX_SCORED = 2_000_000
+"""Most readings of all hypotheses of lost steps together. In larger sessions fewer readings are
+considered."""
 
 MAX_DIVIDED = 5
 """Most sessions of which all divisions into two groups are considered, in any order."""
@@ -75,10 +87,18 @@ def _of_controller(
                     sessions=tuple(filter(None, model.labels[k : k + 1])),
                 )
             )
-            direction = np.zeros(model.problem.n_free)
-            direction[place] = (stated[k] - active) / model.problem.theta_scale[place]
+            changes = dict(zip(place, stated[k] - active, strict=True))
+            direction = _direction(model.problem, changes)
             shifts.append(MachineShift(model.session_of_entry == k, direction))
     yield Family.of(explanations, shifts=shifts)
+
+
+def _direction(problem: CalibrationProblem, changes: Mapping[int, float]) -> Array:
+    """Change of all free parameters, shape (n_free,), [prior std], from those of some, [SI]."""
+    direction = np.zeros(problem.n_free)
+    for i, change in changes.items():
+        direction[i] = change / problem.theta_scale[i]
+    return direction
 
 
 def enter_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
@@ -153,15 +173,12 @@ def _changed(model: LinearModel) -> Iterator[Family]:
     of_offsets: list[tuple[str, Array]] = []
     of_others: list[tuple[str, Array]] = []
     for name, i in place.items():
-        direction = np.zeros(problem.n_free)
-        direction[i] = 1.0 / problem.theta_scale[i]
-        (of_offsets if i in drive_of else of_others).append((name, direction))
+        directions = of_offsets if i in drive_of else of_others
+        directions.append((name, _direction(problem, {i: 1.0})))
     for p in parameters:
         if len(p.terms) > 1 and p.name not in place and all(t in place for t, _ in p.terms):
-            direction = np.zeros(problem.n_free)
-            for term, coefficient in p.terms:
-                direction[place[term]] = coefficient / problem.theta_scale[place[term]]
-            of_others.append((p.name, direction))
+            changes = {place[term]: coefficient for term, coefficient in p.terms}
+            of_others.append((p.name, _direction(problem, changes)))
     for directions in (of_offsets, of_others):
         yield _steps(model, directions, drive_of, place)
 
@@ -199,8 +216,58 @@ def _steps(
                     apart=apart,
                 )
             )
-            shifts.append(MachineShift(model.entries_of(sessions), direction))
+            shifts.append(MachineShift(sessions[model.session_of_entry], direction))
     return Family.of(explanations, shifts=shifts, known=False)
+
+
+def lost_steps(model: LinearModel, rows: Rows) -> Iterator[Family]:
+    """Loss of steps of a drive within a session; none if no offset is identified.
+
+    Large single sessions have none (see `LinearModel.has_shifts`).
+
+    Args:
+        model: The linearised model.
+        rows: The rows.
+    """
+    if not model.has_shifts:
+        return
+    problem, explanations, shifts = model.problem, [], []
+    plus, minus = problem.observations.plus, problem.observations.minus
+    session_of_row = model.session_of_entry[plus]
+    for drive, i in model.offsets.items():
+        direction = _direction(problem, {i: 1.0})
+        for k, label in enumerate(model.labels):
+            of_session = np.flatnonzero(session_of_row == k)
+            for first in _first_readings(of_session, len(model.offsets) * rows.count):
+                later = of_session[of_session >= first]
+                entries = np.zeros(problem.observations.size, dtype=np.bool_)
+                entries[plus[later]] = True
+                entries[minus[later][minus[later] >= 0]] = True
+                explanations.append(
+                    Explanation(
+                        "lost steps",
+                        "session",
+                        first=int(first),
+                        drives=(drive,),
+                        parameters=(problem.free[i],),
+                        sessions=tuple(filter(None, (label,))),
+                    )
+                )
+                shifts.append(MachineShift(entries, direction))
+    rarity = np.full(len(shifts), LOG_PROBABILITY_OF_LOSS)
+    yield Family.of(explanations, shifts=shifts, known=False, log_volume=rarity)
+
+
+def _first_readings(rows: Indices, size: int) -> Indices:
+    """First readings after a loss that are considered, evenly spaced in large sessions.
+
+    Args:
+        rows: Rows of the session, in the order of measuring.
+        size: Number of readings in the hypotheses of one place.
+    """
+    possible = rows[MIN_READINGS : rows.size - MIN_READINGS + 1]
+    step = max(1, -(-possible.size * size // MAX_SCORED))
+    return possible[::step]
 
 
 def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
@@ -250,9 +317,8 @@ def detectable_changes(session: Session) -> dict[str, float]:
     sessions = np.arange(len(model.labels))
     steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
     for drive, i in offsets.items():
-        direction = np.zeros(problem.n_free)
-        direction[i] = 1.0 / problem.theta_scale[i]
-        shifts = [MachineShift(model.entries_of(later), direction) for later in steps]
+        direction = _direction(problem, {i: 1.0})
+        shifts = [MachineShift(later[model.session_of_entry], direction) for later in steps]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
         _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
         changes[drive] = DETECTABLE_CHANGE * float(stds.max())
