@@ -102,11 +102,6 @@ def _count_drives(e: Explanation) -> int:
     return 2 if e.parameters and not e.rows else 0
 
 
-def negative_log_posterior(state: HypothesisSet) -> float:
-    """Negative logarithm of marginal likelihood times prior, as a sort key."""
-    return -state.log_posterior
-
-
 def split_amounts(terms: Sequence[Term], amounts: Array) -> tuple[Array, ...]:
     """Split amounts by term.
 
@@ -237,7 +232,7 @@ def find_alternatives(
     e = term.explanation
     causes: dict[tuple[object, ...], Explanation] = {}
     alternatives: dict[Explanation, None] = {}
-    for chosen, s in sorted(near, key=lambda pair: negative_log_posterior(pair[1])):
+    for chosen, s in sorted(near, key=lambda pair: -pair[1].log_posterior):
         if not any(t is term for t in chosen.terms):
             continue
         only_chosen, only_other = _unmatched(chosen.terms, s.terms)
