@@ -231,9 +231,22 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
         no_anomaly = words.no_anomaly(count_readings(session), within_tolerances=within)
         findings = rank([*findings, no_anomaly])
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
-    action = describe_actions(findings) or lead.action
-    headline = words.SESSION_HEADLINES[judgement.verdict]
-    return Assessment(Decision(judgement.verdict, headline, lead.text, action), findings, (), None)
+    return assess_readings(findings, lead)
+
+
+def assess_readings(
+    findings: tuple[Finding, ...], lead: Finding, tool: ToolErrorSummary | None = None
+) -> Assessment:
+    """Assessment of readings, without values to enter.
+
+    Args:
+        findings: All findings.
+        lead: Finding that the decision quotes.
+        tool: Expected tool error; None if unknown.
+    """
+    verdict, action = verdict_of(findings), describe_actions(findings) or lead.action
+    decision = Decision(verdict, words.SESSION_HEADLINES[verdict], lead.text, action)
+    return Assessment(decision, findings, (), tool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,17 +9,15 @@ from functools import partial
 from typing import Any, get_args
 
 from orthocal.arguments import require_names
-from orthocal.assessment.assess import assess
+from orthocal.assessment.assess import assess, assess_readings
 from orthocal.assessment.effect_comparison import EffectComparison, compare_effects
 from orthocal.assessment.judgement import Judgement, judgement_of, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import comparison as words
-from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
-from orthocal.calibration.assessment_record import Assessment, Decision, Finding, NoiseKind
+from orthocal.calibration.assessment_record import Assessment, Finding, NoiseKind
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
@@ -88,11 +86,8 @@ class Comparison:
         Unless the verdict is `enter`, it contains the judgement alone.
         """
         judgement, best, recommendation = self.judgement, self.best, self.recommendation
-        headline = SESSION_HEADLINES[judgement.verdict]
         if recommendation is None:
-            lead, action = judgement.findings[0], describe_actions(judgement.findings)
-            decision = Decision(judgement.verdict, headline, lead.text, action)
-            return Assessment(decision, judgement.findings, (), None)
+            return assess_readings(judgement.findings, judgement.findings[0])
         notes = words.describe_recommendation(
             recommendation, judged_scale=judgement.tolerance_scale.factor
         )
@@ -110,10 +105,7 @@ class Comparison:
             notes += assessment.of_kind("tool error", "out of reach")
             if best.linearisation_cost is not None:
                 notes.append(words.linearisation_cost(best.linearisation_cost.rms))
-        findings = rank([*judgement.findings, *notes])
-        lead = next((f for f in findings if f.severity != "note"), notes[0])
-        decision = Decision(judgement.verdict, headline, lead.text, lead.action)
-        return Assessment(decision, findings, (), tool)
+        return assess_readings(rank([*judgement.findings, *notes]), notes[0], tool)
 
     def to_json(self) -> str:
         """Comparison as a JSON document, SI units."""
@@ -260,13 +252,12 @@ def _score_with_prior(
 
     Larger models always have a prior, so a small model that lacks one would be at a disadvantage.
     """
-    problem = build()
+    try:
+        return score_model(build(), noises=noises, options=options)
+    except NotIdentifiableError:
+        problem = build(prior=True)
     try:
         return score_model(problem, noises=noises, options=options)
-    except NotIdentifiableError:
-        with_prior = build(prior=True)
-    try:
-        return score_model(with_prior, noises=noises, options=options)
     except NotIdentifiableError as e:
         return Undetermined(problem.selection.label, problem.n_machine, e.problem)
 
