@@ -88,11 +88,9 @@ def find_implausible(session: Session, *, explained: bool = False) -> tuple[Find
     """
     findings: list[Finding | None] = [_legs(session.robot)]
     for part in split_sessions(session):
-        has_offsets = "offsets" in part.robot.parameters.models
-        problem = build_problem(part, model="offsets") if has_offsets else None
         findings += [_check_distances(part), *(() if explained else find_finer(part))]
-        if problem is not None and part.readings:
-            findings += _by_model(part, problem, fit=not explained)
+        if "offsets" in part.robot.parameters.models and part.readings:
+            findings += _by_model(part, fit=not explained)
     return tuple(f for f in findings if f is not None)
 
 
@@ -226,10 +224,9 @@ def are_finer(values: ArrayLike, gauge: Gauge) -> NDArray[np.bool_]:
     return np.asarray(np.abs(steps - np.round(steps)) > STEP_TOLERANCE)
 
 
-def _by_model(
-    session: Session, problem: CalibrationProblem, *, fit: bool
-) -> Iterator[Finding | None]:
+def _by_model(session: Session, *, fit: bool) -> Iterator[Finding | None]:
     """Findings about deviations before a fit, and about residuals of a fit of offsets."""
+    problem = build_problem(session, model="offsets")
     try:
         yield _dimensions(session, problem)
         if not fit or len(session.gauges_with_readings) > 1:
