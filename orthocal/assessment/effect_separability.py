@@ -19,6 +19,7 @@ import numpy as np
 
 from orthocal.arrays import Array, Indices
 from orthocal.assessment.effect_limits import find_limits, parameter_units
+from orthocal.assessment.wording import lines_in_file
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.loading import (
@@ -65,11 +66,10 @@ def _incomplete_conditions(session: Session) -> Iterator[Finding]:
         for condition in (c for c in COLUMNS_OF_CONDITIONS if c in effect.conditions):
             missing = readings_without(session, condition)
             if missing and (explicit or len(missing) < len(session.readings)):
-                one_file = len({r.file for r in missing}) == 1
                 yield words.condition_incomplete(
                     effect,
                     condition,
-                    sorted({r.line for r in missing if r.line is not None}) if one_file else [],
+                    lines_in_file(missing),
                     count_readings(session, missing),
                     count_readings(session),
                     two_postures=any(r.minus for r in missing),
