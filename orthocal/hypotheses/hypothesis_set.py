@@ -168,9 +168,7 @@ def _with_parameters(
 
 def is_same_place(one: HypothesisSet, other: HypothesisSet) -> bool:
     """True if two sets concern the same rows, hypothesis by hypothesis."""
-    if len(one.terms) != len(other.terms):
-        return False
-    return not any(_unmatched(one.terms, other.terms))
+    return len(one.terms) == len(other.terms) and not any(_unmatched(one.terms, other.terms))
 
 
 def adds_a_setup(other: HypothesisSet, chosen: HypothesisSet) -> bool:
@@ -194,11 +192,9 @@ def share_rows(one: Term, other: Term) -> bool:
 def distinct_terms(terms: Sequence[Term]) -> list[Term]:
     """Hypotheses that share no row with a preceding one."""
     distinct: list[Term] = []
-    used: set[int] = set()
     for t in terms:
-        if not used & set(t.explanation.rows):
+        if not any(share_rows(t, preceding) for preceding in distinct):
             distinct.append(t)
-            used |= set(t.explanation.rows)
     return distinct
 
 

@@ -124,7 +124,7 @@ class SetEvaluator:
         It is about the errors without anomalies, or the reference where their readings are not
         possible, as for a tip that misses its rod. None where neither is possible.
         """
-        if not shifts:
+        if not shifts:  # such as for the set without anomalies itself
             return []
         results: list[ModelLinearisation | None] = [None] * len(shifts)
         for about in (self.sound.about, self.reference):
