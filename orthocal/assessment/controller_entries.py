@@ -444,7 +444,7 @@ def weighted_fields(tool: CalibratedTool, field: Array) -> tuple[Array, Array]:
     roots = np.sqrt(tool.workspace.weights)[:, None]
     fields = (tool.workspace.remove_motion(field, tool.targets), field)
     aligned, absolute = (
-        (roots * f.reshape(len(roots), -1)).reshape(-1, *field.shape[2:]) for f in fields
+        (roots * f.reshape(len(roots), -1)).reshape(3 * len(roots), *f.shape[2:]) for f in fields
     )
     return aligned, absolute
 
