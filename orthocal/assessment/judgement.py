@@ -330,11 +330,11 @@ def _independent_contrasts(
         errors of the machine at their tolerances add, shape (n,); the sum of squares of components
         that no error affects, relative to the noise; the degrees of freedom of both together.
     """
-    directions, problem = linearisation.likelihood.directions, model.problem
-    components = directions @ deviation
+    likelihood, problem = linearisation.likelihood, model.problem
+    components = likelihood.directions @ deviation
     rest_square = max(float(deviation @ deviation - components @ components), 0.0) / noise**2
     # derivatives of the components with respect to the errors, in prior standard deviations
-    slopes = linearisation.singular_values[:, None] * linearisation.error_directions.T / noise
+    slopes = likelihood.singular_values[:, None] * likelihood.errors.T / noise
     parameters, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
     names = problem.free[:n]

@@ -377,16 +377,12 @@ class LinearModel:
         expected, complete = readings[machine, entry], jacobians[machine, entry]
         require_finite(self.problem, expected, complete)
         jacobian, none = project_out_zeros(complete, o), np.empty((o.size, 0))
-        likelihood, error_directions, singular_values = build_likelihood(
-            jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
-        )
+        likelihood = build_likelihood(jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated)
         return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
             jacobian if keep_jacobian else none,
             complete if keep_jacobian else none,
             likelihood,
-            error_directions,
-            singular_values,
             theta,
             passive[-1],
         )
@@ -634,9 +630,9 @@ class LinearModel:
             deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             about: The linearisation.
         """
-        errors = about.errors_for(deviation)
-        along = about.singular_values * (about.error_directions.T @ errors)
-        residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
+        errors, likelihood = about.errors_for(deviation), about.likelihood
+        along = likelihood.singular_values * (likelihood.errors.T @ errors)
+        residuals = (deviation - along @ likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 

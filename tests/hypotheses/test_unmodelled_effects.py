@@ -213,7 +213,7 @@ def test_a_half_normal_amount_is_integrated_over():
     """One column, against quadrature at each pair of scales."""
     rng = np.random.default_rng(3)
     jacobian, column = rng.normal(size=(8, 3)), rng.normal(size=8)
-    likelihood, _, _ = build_likelihood(jacobian, sigma=1.0, dof=8, stated=True)
+    likelihood = build_likelihood(jacobian, sigma=1.0, dof=8, stated=True)
     prior = AmountPrior(np.array([1.5]), np.array([True]))
     for amount in (2.0, -1.0):
         deviation = amount * column + rng.normal(size=8)
