@@ -114,11 +114,8 @@ def compute_backlash(
         estimate = by_name.get(name)
         if estimate is None or not (estimate.free or estimate.value):
             continue
-        value, std = max(estimate.value, 0.0), estimate.std if estimate.free else 0.0
-        std_scatter = estimate.std_scatter if estimate.free else 0.0
-        entry = BacklashEntry(
-            drive.name, drive.unit, active_backlash, value, value, std, std_scatter
-        )
+        value, stds = max(estimate.value, 0.0), (estimate.std, estimate.std_scatter)
+        entry = BacklashEntry(drive.name, drive.unit, active_backlash, value, value, *stds)
         uncertainty = expanded_uncertainty(calibration, entry)
         determined = max(value, abs(value - active_backlash)) > uncertainty
         entries.append(entry)
