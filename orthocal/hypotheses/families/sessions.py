@@ -167,35 +167,26 @@ def _by_drives(stated: Array, mistakes: Sequence[tuple[AnomalyKind, Array]]) -> 
 
 def _changed(model: LinearModel) -> Iterator[Family]:
     """One parameter that changes between sessions by an unknown amount."""
-    problem = model.problem
-    parameters, drive_of = problem.robot.parameters, {v: k for k, v in model.offsets.items()}
+    problem, offsets = model.problem, {f"{drive}.offset": drive for drive in model.offsets}
     place = {name: i for i, name in enumerate(problem.free[: problem.n_machine])}
-    of_offsets: list[tuple[str, Array]] = []
-    of_others: list[tuple[str, Array]] = []
-    for name, i in place.items():
-        directions = of_offsets if i in drive_of else of_others
-        directions.append((name, _direction(problem, {i: 1.0})))
-    for p in parameters:
+    changes = {name: {i: 1.0} for name, i in place.items()}
+    for p in problem.robot.parameters:
         if len(p.terms) > 1 and p.name not in place and all(t in place for t, _ in p.terms):
-            changes = {place[term]: coefficient for term, coefficient in p.terms}
-            of_others.append((p.name, _direction(problem, changes)))
-    for directions in (of_offsets, of_others):
-        yield _steps(model, directions, drive_of, place)
+            changes[p.name] = {place[term]: coefficient for term, coefficient in p.terms}
+    directions = {name: _direction(problem, change) for name, change in changes.items()}
+    yield _steps(model, {n: d for n, d in directions.items() if n in offsets}, offsets)
+    yield _steps(model, {n: d for n, d in directions.items() if n not in offsets}, {})
 
 
 def _steps(
-    model: LinearModel,
-    directions: list[tuple[str, Array]],
-    drive_of: dict[int, str],
-    place: dict[str, int],
+    model: LinearModel, directions: Mapping[str, Array], offsets: Mapping[str, str]
 ) -> Family:
     """Change in each direction for each division of the sessions.
 
     Args:
         model: The linearised model.
-        directions: Names of parameters and their changes, shape (n_free,), [prior std].
-        drive_of: Index of the offset of a drive among the free parameters, to the drive.
-        place: Name of a parameter to its index among the free parameters.
+        directions: Name of a parameter to its change, shape (n_free,), [prior std].
+        offsets: Name of an offset to its drive.
     """
     labels, active = model.labels, model.active
     explanations, shifts = [], []
@@ -204,8 +195,8 @@ def _steps(
         names = tuple(labels[k] for k in (later if apart else later[:1]))
         differences = np.abs(active[sessions][:, None] - active[~sessions]).max(axis=2)
         entered = bool(differences.min() > ROUNDING)
-        for name, direction in directions:
-            drive = drive_of.get(place.get(name, -1))
+        for name, direction in directions.items():
+            drive = offsets.get(name)
             explanations.append(
                 Explanation(
                     "offset of one drive" if entered and drive else "machine changed",
