@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from orthocal.assessment.recommendation import weigh_scales
+from orthocal.assessment.wording import lines_in_file
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding
@@ -97,7 +98,7 @@ def find_exchanged_sides(session: Session) -> tuple[Finding, ...]:
         if rows:
             findings.append(
                 words.exchanged_sides(
-                    [line for i in rows if (line := part.readings[i].line) is not None],
+                    lines_in_file([part.readings[i] for i in rows]),
                     exchanged,
                     [place_of(part, i) for i in rows[:MAX_PLACES]],
                 )

@@ -366,11 +366,11 @@ def exchanged_sides(
     """Finding about setups whose readings show a backlash with the opposite sign.
 
     Args:
-        lines: Their lines with stated sides, if they are known.
+        lines: Their lines with stated sides, ascending, if they are known.
         setups: Their names.
         places: Places of their readings.
     """
-    where = f" ({spans(sorted(lines), 'line')})" if lines else ""
+    where = f" ({spans(lines, 'line')})" if lines else ""
     these = "this setup" if len(setups) == 1 else "these setups"
     return review(
         "sides exchanged",
