@@ -529,7 +529,7 @@ class _Twists:
         return twists.reshape(*shape, -1), by_errors.reshape(*shape, *by_errors.shape[1:])
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def error_map(robot: Robot) -> ErrorMap:
     """Error map of a robot, built once."""
     return ErrorMap(robot)

@@ -457,13 +457,13 @@ class LoopClosure:
         )
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def _solutions(robot: Robot) -> ArrayCache:
     """Solutions of a robot from the reference posture, which all models of a session need."""
     return ArrayCache(SOLUTION_CACHE_SIZE)
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def nominal_closure(robot: Robot) -> LoopClosure:
     """Loop closure solver of a robot without errors, built once."""
     return LoopClosure(robot)
@@ -498,7 +498,7 @@ class _UnitRodForces:
         return result
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def _unit_rod_forces(robot: Robot) -> _UnitRodForces:
     """Unit rod forces of a robot, prepared once."""
     return _UnitRodForces(robot)

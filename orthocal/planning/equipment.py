@@ -162,7 +162,7 @@ class Equipment:
         )
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def find_box(robot: Robot) -> Array:
     """Limits of the tool along each coordinate through the mechanical zero, at most ±100 mm.
 
