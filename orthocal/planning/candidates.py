@@ -17,7 +17,7 @@ from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import grid_points, tool_at_zero
 from orthocal.measurement.motion.approach import possible_approaches
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.gauge_noise import stated_sigma
@@ -427,9 +427,8 @@ def _add_postures(
             values = np.linspace(low, high, equipment.along if along else POSITIONS_ACROSS)
             values = np.round(values / POSITION_STEP) * POSITION_STEP + _phases(robot, values.size)
             coordinate_values.append(np.unique(np.clip(values, low, high).round(9)))
-    points = np.stack(np.meshgrid(*coordinate_values, indexing="ij"), axis=-1)
-    points = points.reshape(-1, len(coordinate_values))
-    points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
+    points = grid_points(*coordinate_values).round(9)
+    points = np.unique(np.vstack([np.clip(middle, *box.T), points]), axis=0)
     placed = place_reachable(robot, points, middle)
     if len(placed) < MIN_READINGS:
         within = " and within the soft limits" if equipment.soft_limits else ""
