@@ -23,7 +23,7 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.planning.equipment import Equipment, choose_box, place_reachable
+from orthocal.planning.equipment import Equipment, choose_box, indicators, place_reachable
 from orthocal.planning.expected_error import ENTERED_OFFSET_STD
 from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import PLACE, list_tool_candidates
@@ -476,12 +476,7 @@ def _with_lateral_positions(session: Session) -> Session:
 
     A very wide blade locates the contact with the rod in every posture.
     """
-    robot, wide = session.robot, Tip("blade", 0.0, 10.0)
-    sensors = {
-        name: sensor
-        for name, setup in session.setups.items()
-        if (sensor := indicator_of(setup)) is not None
-    }
+    robot, wide, sensors = session.robot, Tip("blade", 0.0, 10.0), indicators(session)
     on_rods = {
         n: replace(session.setups[n], sensor=s.on_rod(s.rod, wide))
         for n, s in sensors.items()
@@ -511,11 +506,6 @@ def _with_lateral_positions(session: Session) -> Session:
             setups[new_name] = replace(session.setups[name], name=new_name, sensor=displaced)
             readings += [Reading(new_name, r.posture) for r in near]
     return replace(session, setups=setups, readings=tuple(readings))
-
-
-def indicator_of(setup: Setup) -> LegIndicator | None:
-    """Indicator of a setup at a leg; None for another sensor."""
-    return setup.sensor if isinstance(setup.sensor, LegIndicator) else None
 
 
 def _max_lateral_distance(sensor: LegIndicator, robot: Robot) -> float:
