@@ -212,7 +212,7 @@ class _Positions:
         for rod in self.robot.rods.values():
             ends = (poses(frame)[:, :3, 3] for frame in (rod.root, rod.tip))
             clear &= segment_distances(ball, fixed, *ends) >= rod.radius + radius
-        return [name for name, is_clear in zip(names, clear, strict=True) if is_clear]
+        return list(itertools.compress(names, clear))
 
     def approached(
         self, sensor: Sensor, names: Sequence[str]
