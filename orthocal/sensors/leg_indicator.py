@@ -336,13 +336,11 @@ class LegIndicator:
         root, end = (pose.position for pose in view.frames)
         c = view.constants
         direction, axis, side, start = _place(c, [pose.position for pose in view.at_zero])
-        gauge = mount(
+        shift, plunger, edge, scale = mount(
             self.nuisance_parameters, view.nuisance, direction=direction, side=side, axis=axis
         )
-        reading = type(self).touch(
-            root, end - root, c[14], start + gauge.displacement, gauge.direction, gauge.edge
-        )
-        return ca.SX(gauge.scale * reading)
+        reading = type(self).touch(root, end - root, c[14], start + shift, plunger, edge)
+        return ca.SX(scale * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
         """Points of contact in K postures.
