@@ -343,11 +343,8 @@ def _residual_rows(
     Each prediction contains its best-fit gauge zeros.
     """
     problem, observations = fit.problem, fit.problem.observations
-    measured, session, row_noise = (
-        problem.values,
-        problem.session,
-        problem.noise_ratio[observations.plus],
-    )
+    measured, session = problem.values, problem.session
+    row_noise = problem.noise_ratio[observations.plus]
 
     def fitted(prediction: Array) -> Array:
         residual = project_out_zeros(
