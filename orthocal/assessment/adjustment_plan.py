@@ -39,8 +39,8 @@ from orthocal.assessment.controller_entries import (
     weighted_fields,
 )
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
-from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry, ToolErrorSummary
+from orthocal.calibration.build_record import adjust_calibration
 from orthocal.calibration.calibration import (
     Calibration,
     propagate_stds,

@@ -35,7 +35,6 @@ from orthocal.assessment.wording import describe_actions, join_texts
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import place_of
 from orthocal.assessment.words.remedies import command_to_restart
-from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
     EXIT_CODES,
     Assessment,
@@ -45,7 +44,7 @@ from orthocal.calibration.assessment_record import (
     Finding,
     FindingKind,
 )
-from orthocal.calibration.build_record import assemble_calibration
+from orthocal.calibration.build_record import adjust_calibration, assemble_calibration
 from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.calibration.recorded_robot import require_calibrated_robot
 from orthocal.calibration.refit import calibrated_theta, repeat_fit, restore_session

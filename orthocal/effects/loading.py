@@ -122,20 +122,19 @@ def _add_parameters(robot: Robot) -> Robot:
                     f"its parameter '{error.name}' exists already",
                     where=f"{where}.effects.{effect.name}",
                 )
-    elementary, models = tuple(errors.values()), dict(declared.models)
-    for name, patterns in MODELS.items():
-        models.setdefault(name, patterns)
+    elementary, stated = tuple(errors.values()), declared.models
+    models = {**stated, **{name: p for name, p in MODELS.items() if name not in stated}}
     try:
         parameters = build_parameters(
             elementary,
-            sums=declared.sums,
+            sums=declared.parameters,
             overrides=_read_tolerances(robot).overrides,
             models=models,
             find_redundant=partial(find_redundant_errors, robot, elementary),
             further=adjustment_parameters(robot, errors),
         )
     except ParameterError as e:
-        raise RobotError(e.problem, where=where) from None
+        raise RobotError(str(e), where=where) from None
     return replace(robot, parameters=parameters)
 
 

@@ -173,7 +173,7 @@ def group_sensors(session: Session, observations: Observations) -> tuple[SensorG
         constants = {i: setups[i].sensor.constants(robot) for i in members}
         setup_of = observations.setup[entries]
         table = np.array([constants[i] for i in setup_of.tolist()])
-        conditions = [observations.conditions[c][entries] for c in reading.conditions]
+        conditions = [observations.conditions[c][entries] for c in reading.pattern.conditions]
         table = np.hstack([table.reshape(entries.size, -1), *conditions])
         indices = np.array([nuisance[i] for i in setup_of.tolist()], dtype=np.int64)
         indices = indices.reshape(entries.size, -1)

@@ -18,7 +18,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from orthocal.arrays import Array
 from orthocal.io.documents import Count, Number
-from orthocal.io.fields import CLOSED, Many, Size, Vector, read_only
+from orthocal.io.fields import FileRecord, Many, Size, Vector, read_only
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
@@ -81,10 +81,8 @@ Recorded = Annotated[
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Identifiability:
+class Identifiability(FileRecord):
     """Identifiability of the free parameters from the readings."""
-
-    __pydantic_config__ = CLOSED
 
     singular_values: Vector
     """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m of

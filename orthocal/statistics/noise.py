@@ -14,7 +14,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.io.documents import Count
-from orthocal.io.fields import CLOSED, Size, SizeOrInf, SizeOrNaN
+from orthocal.io.fields import FileRecord, Size, SizeOrInf, SizeOrNaN
 from orthocal.observation.gauge_noise import noise_floor
 from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
@@ -33,10 +33,8 @@ _SOURCES: tuple[NoiseSource, ...] = ("residuals", "cycles", "gauge", "unknown")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
+class Noise(FileRecord):
     """Standard deviation of one reading of the indicator, and its source."""
-
-    __pydantic_config__ = CLOSED
 
     sigma: SizeOrNaN
     """Standard deviation of a reading, [m]; NaN if unknown. That of a difference is √2 of it."""

@@ -27,7 +27,7 @@ from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.assessment.tool_error import measure_deviations
 from orthocal.assessment.words.adjustment import HEADLINES
-from orthocal.calibration.adjusting import adjust_calibration
+from orthocal.calibration.build_record import adjust_calibration
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.errors import ParameterError, RobotError
 from orthocal.output.report.page import build_report

@@ -274,7 +274,7 @@ class ProgramFunctions:
         self, expressions: ReadingExpressions, names: Sequence[str]
     ) -> dict[str, ca.Function]:
         """Some of the cached functions of a reading, by name (see `_build_reading`)."""
-        sensor = expressions.group.reading.name
+        sensor = expressions.group.reading.pattern.name
         built: dict[str, ca.Function] = {}
 
         def build(name: str) -> ca.Function:
