@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from orthocal.arguments import require_array
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Triple
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import with_effects
 from orthocal.errors import SessionError
@@ -27,7 +27,7 @@ from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import GaugeZero, Sensor, Triple, is_difference
+from orthocal.sensors.protocol import GaugeZero, Sensor, is_difference
 from orthocal.units import MM
 
 DISTANCE_DECIMALS = 9

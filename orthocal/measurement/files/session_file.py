@@ -15,6 +15,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
+from orthocal.arrays import triple
 from orthocal.effects.adjustment import require_adjustment
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import load_robot, with_effects
@@ -50,7 +51,6 @@ from orthocal.sensors.protocol import (
     SetupKeys,
     default_zero,
     reads_pairs,
-    triple,
 )
 from orthocal.sensors.registry import read_setup
 from orthocal.session.completeness import require_name

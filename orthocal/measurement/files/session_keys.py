@@ -10,12 +10,13 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
+from orthocal.arrays import triple
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Keys, Name, Number, OneKey, PositiveNumber
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import ScaleTolerance
-from orthocal.sensors.protocol import LARGEST_READING, triple
+from orthocal.sensors.protocol import LARGEST_READING
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Mask, Triple
 from orthocal.effects.loading import robot_effects
 from orthocal.kinematics.conditions import APPROACH as SIGN_OF_LETTER
 from orthocal.kinematics.conditions import ARROWS
@@ -19,7 +19,7 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import find_below_bed
 from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.protocol import PROBING_DISTANCE, Triple, probing_direction, tool_path
+from orthocal.sensors.protocol import PROBING_DISTANCE, probing_direction, tool_path
 from orthocal.session.session import Posture, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Triple
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.readings_file import FIRST_LINE
@@ -52,11 +52,7 @@ from orthocal.measurement.motion.stops import (
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.sensors.protocol import (
-    Triple,
-    has_dial,
-    reads_pairs,
-)
+from orthocal.sensors.protocol import has_dial, reads_pairs
 from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM

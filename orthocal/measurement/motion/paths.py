@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Triple
 from orthocal.errors import ClosureError, UnreachablePathError
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
@@ -17,7 +17,7 @@ from orthocal.kinematics.workspace import position_at_zero
 from orthocal.measurement.motion.guidance import below_bed
 from orthocal.measurement.motion.stops import Stop
 from orthocal.robot.model import require_tcp
-from orthocal.sensors.protocol import ToolPath, Triple, probing_direction, tool_path
+from orthocal.sensors.protocol import ToolPath, probing_direction, tool_path
 from orthocal.session.session import Session
 
 STEP = 5e-3
