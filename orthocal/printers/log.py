@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
-from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
+from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings, FirmwareName
 from orthocal.units import DEG, MM
 
 MIN_POINTS = 3
@@ -27,6 +28,9 @@ LARGEST_COORDINATE = 2.0
 
 SAME_PLACE = 0.05 * MM
 """Largest distance of successive probings that are samples of one point, along x or y, [m]."""
+
+DECIMALS = 4
+"""Decimals of settings in G-code."""
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
@@ -79,6 +83,8 @@ class LogText:
 
     files: tuple[tuple[str, str], ...]
     """Name and text of each file; the log is the last one."""
+    radius: float | None = None
+    """Radius of the points of Marlin's G33, or half the side of its grid, [m]."""
 
     @property
     def text(self) -> str:
@@ -118,12 +124,6 @@ def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:
         SessionError: If a text is not a finite number.
     """
     return [parse_number(t.strip(), where=where, name=name, error=SessionError) for t in texts]
-
-
-def average_samples(points: Array) -> Array:
-    """Average successive samples of the same place, shape (K, 3), [m]."""
-    begins = _place_begins(points)
-    return np.array([np.mean(group, axis=0) for group in np.split(points, begins[1:])])
 
 
 def _place_begins(points: Array) -> list[int]:
@@ -236,7 +236,8 @@ def probed_log(
             where=where,
         )
     settings.require_plausible(where=where)
-    points = average_samples(nozzle)
+    places = np.split(nozzle, _place_begins(nozzle)[1:])
+    points = np.array([samples.mean(axis=0) for samples in places])
     require_points(len(points), where=where, expected=expected)
     try:
         carriages = settings.inverse(points)
@@ -312,6 +313,51 @@ def command_words(text: str, pattern: str) -> Iterator[tuple[int, dict[str, str]
 def read_words(text: str) -> dict[str, str]:
     """Letters and values of a G-code line, also if no blanks separate them."""
     return dict(re.findall(rf"(?<![A-Za-z])([A-Z]) ?({NUMBER}(?::{NUMBER})*)", text))
+
+
+def write_words(letters: str, values: Array) -> str:
+    """Words of a G-code line."""
+    words = zip(letters, values + 0.0, strict=True)  # not -0.0
+    return " ".join(f"{letter}{value:.{DECIMALS}f}" for letter, value in words)
+
+
+def settings_of_m665(
+    firmware: FirmwareName,
+    m665: Mapping[str, str],
+    rods: ArrayLike,
+    stops: ArrayLike,
+    probe: Array,
+    where: str,
+    *,
+    raised: float = 0.0,
+) -> DeltaSettings:
+    """Settings of the G-code command M665.
+
+    Args:
+        firmware: The firmware.
+        m665: Values of R and H, [mm], and of X, Y and Z, [°], by letter.
+        rods: Lengths of the rods, shape (3,), [mm].
+        stops: Heights of the endstops above H, shape (3,), [mm].
+        probe: Tip of the probe at the trigger, from the nozzle, shape (3,), [m].
+        where: Name of the log, for messages.
+        raised: Height of the zero of H above that of the nozzle, [m].
+
+    Raises:
+        SessionError: If a value is no number, or the rods are too short.
+    """
+    radius, height = numbers([m665[k] for k in "RH"], where=where, name="M665")
+    turns = numbers([m665.get(k, "0") for k in "XYZ"], where=where, name="M665")
+    shortest = np.min(rods)
+    if not 0.0 < radius < shortest:
+        raise SessionError(
+            f"M665 has R {radius:g} and rods from {shortest:g}; expected a positive radius and "
+            "longer rods",
+            where=where,
+        )
+    homed = (height + np.sqrt(np.square(rods) - radius**2) + stops) * MM - raised
+    angles = triple(DESIGN_ANGLES + np.array(turns) * DEG)
+    rods = triple(np.asarray(rods), MM)
+    return DeltaSettings(firmware, radius * MM, rods, triple(homed), angles, probe=triple(probe))
 
 
 def require_one_value(source: LogText, command: str, *, since: int = 0, until: int) -> None:

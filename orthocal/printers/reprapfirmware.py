@@ -7,6 +7,7 @@ src/Movement/Kinematics/LinearDeltaKinematics.cpp, src/Movement/BedProbing/Rando
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.printers.log import (
+    DECIMALS,
     NUMBER,
     LogText,
     PrinterLog,
@@ -21,13 +23,12 @@ from orthocal.printers.log import (
     numbers,
     probed_log,
     read_words,
+    settings_of_m665,
     unstated_trigger,
+    write_words,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
-
-DECIMALS = 4
-"""Decimals of settings."""
 
 EXPECTED = (
     "the line 'bed probe heights:' that G30 or G32 with S-1 reports, and the lines 'G30 P X Y' of "
@@ -54,17 +55,12 @@ def recognise(text: str) -> bool:
     return any(p.search(text) for p in (_HEIGHTS, _M665, _CALIBRATED, _STOPPED))
 
 
-def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
+def read_log(source: LogText) -> PrinterLog:
     """Read settings and probed points.
-
-    Args:
-        source: The log and files with settings and points.
-        radius: Not used.
 
     Raises:
         SessionError: If the text is invalid; names the line or the missing setting.
     """
-    del radius
     text, where = source.text, source.name
     reports = list(_HEIGHTS.finditer(text))
     if not reports:
@@ -193,40 +189,20 @@ def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
             )
     rods = numbers(m665["L"].split(":"), where=where, name="M665 L")
     rods = rods if len(rods) == 3 else [rods[0]] * 3
-    radius, height = numbers([m665[k] for k in "RH"], where=where, name="M665")
-    turns = numbers([m665.get(k, "0") for k in "XYZ"], where=where, name="M665")
     stops = numbers([m666.get(k, "0") for k in "XYZ"], where=where, name="M666")
-    tilts = numbers([m666.get(k, "0") for k in "AB"], where=where, name="M666")
-    if not 0.0 < radius < min(rods):
-        raise SessionError(
-            f"M665 has R {radius:g} and rods from {min(rods):g}; expected a positive radius and "
-            "longer rods",
-            where=where,
-        )
-    homed = height + np.sqrt(np.array(rods) ** 2 - radius**2) + stops
-    a, b, c = (np.array(DESIGN_ANGLES) + np.array(turns) * DEG).tolist()
-    return DeltaSettings(
-        "reprapfirmware",
-        radius * MM,
-        (rods[0] * MM, rods[1] * MM, rods[2] * MM),
-        (homed[0].item() * MM, homed[1].item() * MM, homed[2].item() * MM),
-        (a, b, c),
-        (tilts[0] / 100.0, tilts[1] / 100.0),
-        (probe[0].item(), probe[1].item(), probe[2].item()),
-    )
+    a, b = numbers([m666.get(k, "0") for k in "AB"], where=where, name="M666")
+    settings = settings_of_m665("reprapfirmware", m665, rods, stops, probe, where)
+    return replace(settings, tilts=(a / 100.0, b / 100.0))
 
 
 def config_lines(settings: DeltaSettings) -> str:
     """Lines of config.g, and of config-override.g if M501 reads it."""
     n, height = DECIMALS, float(settings.endstops.mean())
     rods = ":".join(f"{v / MM:.{n}f}" for v in settings.rods)
-    turns = (np.array(settings.angles) - DESIGN_ANGLES) / DEG + 0.0
-    turned = " ".join(f"{k}{v:.{n}f}" for k, v in zip("XYZ", turns, strict=True))
-    stops = " ".join(
-        f"{k}{v:.{n}f}" for k, v in zip("XYZ", (settings.endstops - height) / MM, strict=True)
-    )
-    a, b = (100.0 * v for v in settings.tilts)
+    turns = (np.array(settings.angles) - DESIGN_ANGLES) / DEG
+    stops = write_words("XYZ", (settings.endstops - height) / MM)
+    tilts = write_words("AB", 100.0 * np.array(settings.tilts))
     return (
-        f"M665 L{rods} R{settings.radius / MM:.{n}f} H{height / MM:.{n}f} {turned}\n"
-        f"M666 {stops} A{a:.{n}f} B{b:.{n}f}\n"
+        f"M665 L{rods} R{settings.radius / MM:.{n}f} H{height / MM:.{n}f} "
+        f"{write_words('XYZ', turns)}\nM666 {stops} {tilts}\n"
     )

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED
@@ -96,8 +96,8 @@ class DeltaSettings:
 
     def moved(self, change: Array) -> DeltaSettings:
         """Same settings with coordinates of the carriages that differ by `change`, (3,), [m]."""
-        homed, shift = np.array(self.homed) + change, np.array(self.shift) + change
-        return replace(self, homed=tuple(homed.tolist()), shift=tuple(shift.tolist()))
+        homed, shift = triple(change + self.homed), triple(change + self.shift)
+        return replace(self, homed=homed, shift=shift)
 
     def inverse(self, points: ArrayLike) -> Array:
         """Coordinates of the carriages at nozzle positions (K, 3), shape (K, 3), [m].

@@ -113,7 +113,8 @@ def import_printer_log(
         tuple(
             (str(p), RECEIVED.sub("", read_text(Path(p), error=SessionError)))
             for p in (*settings, log)
-        )
+        ),
+        radius,
     )
     name = None if firmware is None else require_firmware(firmware, option="--format")
     name = name or find_firmware(source.text[source.begin :]) or find_firmware(source.text)
@@ -123,7 +124,7 @@ def import_printer_log(
             f"{', '.join(FIRMWARES)}",
             where=str(log),
         )
-    content = FIRMWARES[name].read_log(source, radius=radius)
+    content = FIRMWARES[name].read_log(source)
     return PrinterImport(content, _session(content, Path(log)))
 
 
