@@ -20,12 +20,7 @@ from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.observation.conditions import needed_conditions
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import (
-    LARGEST_READING,
-    is_difference,
-    largest_reading,
-    reads_pairs,
-)
+from orthocal.sensors.protocol import is_difference, largest_reading, reads_pairs
 from orthocal.session.completeness import require_name
 from orthocal.session.differences import IndependentReadings
 from orthocal.session.points import count_readings
@@ -295,13 +290,13 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
             "conditions belong to readings in one posture",
             where=row.where,
         )
-    if row.approach:
-        require_approach(row.approach, robot, row.where)
-    return Conditions(
+    conditions = Conditions(
         row.approach or None,
         parse_temperature(row.temperature_C, row.where) if row.temperature_C else None,
         parse_time(row.time, row.where) if row.time else None,
     )
+    check_conditions(conditions, robot, two_postures=False, where=row.where)
+    return conditions
 
 
 def check_conditions(
@@ -322,21 +317,11 @@ def check_conditions(
         raise SessionError(
             "has two postures; conditions belong to readings in one posture", where=where
         )
-    if conditions.approach is not None:
-        require_approach(conditions.approach, robot, where)
+    approach = conditions.approach
+    if approach is not None and (problem := find_approach_problem(approach, robot)):
+        raise SessionError(f"approach is {problem}", where=where)
     if conditions.temperature is not None:
         _require_temperature(conditions.temperature, where)
-
-
-def require_approach(text: str, robot: Robot, where: str) -> None:
-    """Refuse an approach that is not a letter for each drive.
-
-    Raises:
-        SessionError: If the approach is wrong.
-    """
-    problem = find_approach_problem(text, robot)
-    if problem:
-        raise SessionError(f"approach is {problem}", where=where)
 
 
 def parse_temperature(text: str, where: str) -> float:
@@ -397,9 +382,9 @@ def check_range(
     *,
     difference: bool,
     where: str,
-    name: str = "reading_mm",
-    largest: float = LARGEST_READING,
-    of_setup_mm: ArrayLike = (),
+    name: str,
+    largest: float,
+    of_setup_mm: ArrayLike,
 ) -> None:
     """Refuse a reading beyond the range of the gauge or of its kind of sensor. NaN passes.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,7 @@ from orthocal.effects.compensation import Compensation, JointTrim, with_homes
 from orthocal.errors import SessionError
 from orthocal.io.fields import read_only
 from orthocal.measurement.files.linuxcnc_ini import read_comp_file
-from orthocal.measurement.files.session_keys import (
-    BACKLASH_KEYS,
-    HOME_KEYS,
-    OFFSET_KEYS,
-    ControllerKeys,
-    keys_for_unit,
-)
+from orthocal.measurement.files.session_keys import ControllerKeys, Quantity, drive_value_keys
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Drive, Robot, drive_keys
 from orthocal.units import Unit
@@ -68,7 +62,7 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
     Raises:
         SessionError: If numbers and drives do not match.
     """
-    return None if keys is None else _read_drive_values(keys, OFFSET_KEYS, "offset", robot, where)
+    return None if keys is None else _read_drive_values(keys, "offsets", robot, where)
 
 
 def build_compensation(
@@ -88,8 +82,8 @@ def build_compensation(
     """
     if keys is None:
         return ()
-    backlash = _read_drive_values(keys, BACKLASH_KEYS, "backlash", robot, where)
-    homes = _read_drive_values(keys, HOME_KEYS, "home offset", robot, where)
+    backlash = _read_drive_values(keys, "backlash", robot, where)
+    homes = _read_drive_values(keys, "home_offset", robot, where)
     if backlash is None and keys.comp_file is None:
         if homes is not None:
             stated = drive_keys("backlash", robot.drives)
@@ -129,18 +123,13 @@ def build_firmware(keys: ControllerKeys | None, robot: Robot, where: str) -> Del
 
 
 def _read_drive_values(
-    keys: ControllerKeys,
-    key_units: Mapping[str, tuple[Unit, float]],
-    quantity: str,
-    robot: Robot,
-    where: str,
+    keys: ControllerKeys, quantity: Quantity, robot: Robot, where: str
 ) -> Array | None:
     """Assemble one value per drive from the keys for prismatic and revolute drives.
 
     Args:
         keys: Keys under `controller`.
-        key_units: Keys of the quantity, with the SI unit of their drives and the factor to SI.
-        quantity: Name of the quantity, for messages.
+        quantity: The quantity.
         robot: The robot.
         where: File and key, for messages.
 
@@ -150,9 +139,10 @@ def _read_drive_values(
     Raises:
         SessionError: If numbers and drives do not match.
     """
-    stated = [key for key in key_units if getattr(keys, key) is not None]
+    stated = keys.stated(quantity)
     if not stated:
         return None
+    key_units = drive_value_keys(quantity)
     result = np.zeros(len(robot.drives))
     units: set[str] = set()
     for key in stated:
@@ -175,8 +165,9 @@ def _read_drive_values(
         units.add(unit)
     for drive in robot.drives:
         if drive.unit not in units:
-            expected = " or ".join(keys_for_unit(key_units, drive.unit))
+            expected = " or ".join(drive_value_keys(quantity, drive.unit))
+            noun = quantity.removesuffix("s").replace("_", " ")
             raise SessionError(
-                f"the {quantity} of drive {drive.name} is missing; add {expected}", where=where
+                f"the {noun} of drive {drive.name} is missing; add {expected}", where=where
             )
     return read_only(result)

@@ -62,7 +62,7 @@ def build_postures(
     require_independent_rows(robot)
     closure = nominal_closure(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
-    offset_keys = [] if keys.controller is None else keys.controller.offset_keys
+    offset_keys = [] if keys.controller is None else keys.controller.stated("offsets")
     stated = {n: _read_posture(p, robot, f"{file}: postures.{n}") for n, p in keys.postures.items()}
     points = {name: values for name, (form, values) in stated.items() if form == "tcp"}
     try:

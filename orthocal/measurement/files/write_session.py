@@ -13,7 +13,12 @@ import yaml
 
 from orthocal.arguments import require_kind
 from orthocal.effects.adjustment import subtract_amounts
-from orthocal.effects.compensation import compensates_alike, format_table, table_name
+from orthocal.effects.compensation import (
+    compensates_alike,
+    format_table,
+    home_positions,
+    table_name,
+)
 from orthocal.errors import SessionError
 from orthocal.io.documents import validate
 from orthocal.io.files import exists, write_file, write_files
@@ -54,31 +59,30 @@ def session_document(session: Session) -> dict[str, Any]:
             `_require_one_state`.
     """
     _require_one_state(session)
-    document: dict[str, Any] = {"robot": session.robot_reference}
-    if session.title:
-        document["title"] = session.title
-    if session.source:
-        document["source"] = session.source
-    if session.seed is not None:
-        document["seed"] = int(session.seed)
     gauges = {
         name: _gauge_document(g) for name, g in session.gauges.items() if base_name(name) == name
     }
-    if "" not in gauges:
-        document["gauges"] = gauges
-    elif gauges[""]:
-        document["gauge"] = gauges[""]
-    document["postures"] = {
-        p.name: _posture_document(p, session.robot) for p in session.postures.values()
+    postures = session.postures.values()
+    entries = {
+        "robot": session.robot_reference,
+        "title": session.title,
+        "source": session.source,
+        "seed": None if session.seed is None else int(session.seed),
+        "gauges": {} if "" in gauges else gauges,
+        "gauge": gauges.get("", {}),
+        "postures": {p.name: _posture_document(p, session.robot) for p in postures},
+        "payload_kg": _payload(session) or None,
+        "controller": _controller_document(session),
+        "adjusted_mm": {n: tidy(v / MM) for n, v in session.adjusted.items()},
+        "calibration": _calibration_document(session),
+        "setups": _setup_documents(session),
+        "readings": "readings.csv",
     }
-    if payload := _payload(session):
-        document["payload_kg"] = payload
-    if controller := _controller_document(session):
-        document["controller"] = controller
-    if session.adjusted:
-        document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
-    if calibration := _calibration_document(session):
-        document["calibration"] = calibration
+    return {key: value for key, value in entries.items() if value not in (None, "", {})}
+
+
+def _setup_documents(session: Session) -> dict[str, dict[str, Any]]:
+    """Keys of each setup by name; a setup of points is one, as in its files."""
     aligned_at, elsewhere = session.alignment_postures, balls_aligned_elsewhere(session)
     setups: dict[str, Any] = {}
     for setup in session.setups.values():
@@ -98,9 +102,7 @@ def session_document(session: Session) -> dict[str, Any]:
                 **({"zero": setup.zero} if setup.zero != default_zero(sensor) else {}),
             },
         )
-    document["setups"] = setups
-    document["readings"] = "readings.csv"
-    return document
+    return setups
 
 
 def _posture_document(posture: Posture, robot: Robot) -> dict[str, list[float]]:
@@ -171,18 +173,18 @@ def _calibration_document(session: Session) -> dict[str, Any]:
 def _controller_document(session: Session) -> dict[str, Any]:
     """Offsets of prismatic drives in mm, of revolute drives in mrad, and the compensation."""
     document: dict[str, Any] = {}
+    stated: dict[str, Sequence[float]] = {}
     if session.controller_offsets is not None:
         for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
             key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
             document.setdefault(key, []).append(tidy(float(offset) / MM))
     if any(joint.backlash or joint.table is None for joint in session.compensation):
-        for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
-            backlash = tidy(joint.backlash / drive.joint_size)
-            document.setdefault(f"backlash_{drive.joint_unit}", []).append(backlash)
-    for drive, joint in zip(session.robot.drives, session.compensation, strict=False):
-        if joint.home is not None:
-            home = tidy(joint.home / drive.joint_size)
-            document.setdefault(f"home_offset_{drive.joint_unit}", []).append(home)
+        stated["backlash"] = [joint.backlash for joint in session.compensation]
+    stated["home_offset"] = home_positions(session.compensation) or ()
+    for quantity, values in stated.items():
+        for drive, value in zip(session.robot.drives, values, strict=False):
+            key = f"{quantity}_{drive.joint_unit}"
+            document.setdefault(key, []).append(tidy(value / drive.joint_size))
     if any(joint.table is not None for joint in session.compensation):
         document["comp_file"] = [
             None if joint.table is None else table_name(i)
