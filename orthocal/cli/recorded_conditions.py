@@ -10,9 +10,8 @@ from orthocal.errors import SessionError
 from orthocal.io.tables.numerals import plain_minus
 from orthocal.kinematics.conditions import APPROACH, find_approach_problem
 from orthocal.measurement.files.readings_checks import parse_temperature
-from orthocal.measurement.recorded_rows import RecordedReading
+from orthocal.measurement.recorded_rows import NextConditions, RecordedReading
 from orthocal.measurement.recording import Recording
-from orthocal.measurement.recording_journal import NextConditions
 from orthocal.observation.conditions import needed_conditions
 from orthocal.session.session import Conditions
 

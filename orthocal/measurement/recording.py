@@ -39,13 +39,16 @@ from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
 from orthocal.measurement.motion.motion import state_possible_path_approaches
 from orthocal.measurement.recorded_rows import (
+    CLOSED,
     Change,
+    NextConditions,
     RecordedReading,
     change_rows,
     find_dropped,
+    find_pending,
+    read_lines,
     recorded_rows,
 )
-from orthocal.measurement.recording_journal import CLOSED, NextConditions, find_pending, read_lines
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.protocol import largest_reading
 from orthocal.session.order import order_of_measurement

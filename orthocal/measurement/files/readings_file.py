@@ -249,7 +249,6 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             name=str(path),
             required=required,
             optional=optional,
-            error=SessionError,
             most=MOST_CSV_ROWS,
         )
 
@@ -260,22 +259,15 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             for line, row in islice(rows(), MOST_READINGS + 1):
                 names = ("reading_mm", *COORDINATES)
                 numerals += [Numeral(row[name], line) for name in names if row.get(name)]
-        sign = _standard_decimal_sign(numerals, path)
+        sign = decide_decimal_sign(
+            numerals, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
+        ).sign
     for line, cells in rows():
         cells |= {n: _standard_number(text, sign) for n, text in cells.items() if n in NUMBERS}
         yield RawReading(f"{path}:{line}", line, **cells)
 
 
 SIGN_ADVICE = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
-
-
-def _standard_decimal_sign(cells: Sequence[Numeral], path: Path) -> Sign:
-    """Decimal sign of a table with standard headings, where a point is always a decimal point."""
-    if not any("," in cell.text for cell in cells):
-        return "point"
-    return decide_decimal_sign(
-        cells, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
-    ).sign
 
 
 def _standard_number(text: str, sign: Sign) -> str:

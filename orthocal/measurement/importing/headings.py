@@ -64,17 +64,8 @@ WORDS: dict[Role, tuple[str, ...]] = {
     ),
     "cycle": (
         *("cycle", "cycles", "repeat", "repetition", "rep", "rep.", "run", "pass", "round"),
-        *(
-            "wdh",
-            "wdh.",
-            "zyklus",
-            "durchgang",
-            "wiederholung",
-            "lauf",
-            "durchlauf",
-            "messreihe",
-            "umlauf",
-        ),
+        *("wdh", "wdh.", "zyklus", "durchgang", "wiederholung"),
+        *("lauf", "durchlauf", "messreihe", "umlauf"),
     ),
     "reading": (
         *("reading", "readings", "value", "measured", "measured value", "measurement"),
@@ -229,9 +220,12 @@ def split_degrees(text: str) -> tuple[str, Degrees | None]:
 
 def _normalize(text: str) -> str:
     """Heading in lower case with single blanks; empty if it is too long for a heading."""
-    if len(text) > LONGEST_HEADING:
-        return ""
-    return " ".join(tidy_text(composed(text)).casefold().split())
+    return _plain(text).casefold()
+
+
+def _plain(text: str) -> str:
+    """Heading with single blanks; empty if it is too long for a heading."""
+    return " ".join(tidy_text(composed(text)).split()) if len(text) <= LONGEST_HEADING else ""
 
 
 def _split_unit(plain: str) -> tuple[str, UnitName | None]:
@@ -341,15 +335,11 @@ def _find_column(texts: Sequence[str], name: str) -> list[int]:
     if numbered:
         index = int(numbered[1]) - 1
         return [index] if 0 <= index < len(texts) else []
-
-    def plain(text: str) -> str:
-        return " ".join(tidy_text(composed(text)).split()) if len(text) <= LONGEST_HEADING else ""
-
-    wanted = plain(name)
-    plain_texts = [plain(text) for text in texts]
-    exact = [i for i, text in enumerate(plain_texts) if text and text == wanted]
-    folded = wanted.casefold()
-    return exact or [i for i, text in enumerate(plain_texts) if text and text.casefold() == folded]
+    for simplify in (_plain, _normalize):
+        wanted = simplify(name)
+        if indices := [i for i, text in enumerate(map(simplify, texts)) if text and text == wanted]:
+            return indices
+    return []
 
 
 def choose_columns(

@@ -183,7 +183,7 @@ class _Rows:
 
     def skip(self, length: LengthCell) -> None:
         """Record an empty cell."""
-        row = _with_session_names(length.row, self.setups, self.postures)
+        row = self._with_session_names(length.row)
         if _is_known(row.setup, self.setups) and _is_known(row.posture, self.postures):
             self.missing.append(row)
         elif (row.line, NO_READING) not in self.skipped[-1:]:
@@ -191,8 +191,8 @@ class _Rows:
 
     def add(self, length: LengthCell, value: Decimal, unit: UnitName) -> None:
         """Record a number."""
-        row = _with_session_names(length.row, self.setups, self.postures)
-        names = zip(_names(length.row), _names(row), strict=True)
+        row = self._with_session_names(length.row)
+        names = ((getattr(length.row, k), getattr(row, k)) for k in ("setup", "posture", "minus"))
         self.renamed |= {old: new for old, new in names if old != new}
         self.units[unit] = None
         with localcontext(prec=2 * LONGEST_NUMBER):
@@ -203,6 +203,15 @@ class _Rows:
         key = row.line, row.cycle
         cell: dict[str, Any] = {f"{length.role}_mm": format_mm(value)}
         self.by_place[key] = replace(self.by_place.get(key, row), **cell)
+
+    def _with_session_names(self, row: RawReading) -> RawReading:
+        """Row with the names in the session instead of those in the table."""
+        return replace(
+            row,
+            setup=_session_name(row.setup, self.setups),
+            posture=_session_name(row.posture, self.postures),
+            minus=_session_name(row.minus, self.postures),
+        )
 
     def located(self, points: Mapping[str, Array]) -> tuple[RawReading, ...]:
         """Rows in which commanded points are replaced by their postures.
@@ -262,20 +271,6 @@ def _require_names(
             raise SessionError(
                 f"has a reading but no {role}; {advice}", where=table.place(row.line)
             )
-
-
-def _names(row: RawReading) -> tuple[str, str, str]:
-    return row.setup, row.posture, row.minus
-
-
-def _with_session_names(row: RawReading, setups: NamesByFold, postures: NamesByFold) -> RawReading:
-    """Row with the names in the session instead of those in the table."""
-    return replace(
-        row,
-        setup=_session_name(row.setup, setups),
-        posture=_session_name(row.posture, postures),
-        minus=_session_name(row.minus, postures),
-    )
 
 
 def _read_lengths(
