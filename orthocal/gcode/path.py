@@ -142,16 +142,18 @@ class Paths:
             first: Parameter of the start of each part, 0 to 1, shape (k,).
             last: Parameter of the end of each part, shape (k,).
         """
-        c, share = curve, last - first
+        c, share = curve, (last - first)[:, None]
+        begin = first[:, None]
+
+        def part(line: Array) -> Array:
+            """Value at the start of each part, and its change."""
+            return np.hstack([line[c, :1] + begin * line[c, 1:], share * line[c, 1:]])
+
         return Paths(
-            self.base[c] + first[:, None] * self.slope[c],
-            share[:, None] * self.slope[c],
-            np.stack(
-                [self.radius[c, 0] + first * self.radius[c, 1], share * self.radius[c, 1]], axis=1
-            ),
-            np.stack(
-                [self.angle[c, 0] + first * self.angle[c, 1], share * self.angle[c, 1]], axis=1
-            ),
+            self.base[c] + begin * self.slope[c],
+            share * self.slope[c],
+            part(self.radius),
+            part(self.angle),
             self.axes[c],
         )
 

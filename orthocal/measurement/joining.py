@@ -19,7 +19,7 @@ from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
-from orthocal.session.session import Posture, Session, Setup, split_label
+from orthocal.session.session import Session, Setup, split_label
 from orthocal.text import composed
 
 CACHE_SIZE = 4
@@ -311,14 +311,11 @@ def _rename(session: Session, labels: Mapping[str, str]) -> Session:
             compensation=session.compensation if s.compensation is None else s.compensation,
         )
 
-    def posture(p: Posture) -> Posture:
-        return replace(p, name=named(p.name))
-
     return replace(
         session,
         gauges={named(name): gauge for name, gauge in session.gauges.items()},
         setups={named(s.name): setup(s) for s in session.setups.values()},
-        postures={named(p.name): posture(p) for p in session.postures.values()},
+        postures={named(n): replace(p, name=named(n)) for n, p in session.postures.items()},
         readings=tuple(
             replace(
                 r,

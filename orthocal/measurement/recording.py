@@ -25,18 +25,16 @@ from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.point_rows import (
-    find_point,
-    locate_stations,
-    point_of,
-    value_name,
-)
+from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of, value_name
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
-from orthocal.measurement.files.session_edits import add_alignment, add_readings
 from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import MOST_READINGS
-from orthocal.measurement.files.write_session import readings_table
+from orthocal.measurement.files.write_session import (
+    add_alignment,
+    add_readings,
+    readings_table,
+)
 from orthocal.measurement.motion.motion import state_possible_path_approaches
 from orthocal.measurement.recorded_rows import (
     CLOSED,

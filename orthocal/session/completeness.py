@@ -15,15 +15,7 @@ from orthocal.io.documents import MOST_SHOWN
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.sensors.protocol import GaugeZero
 from orthocal.session.differences import IndependentReadings
-from orthocal.session.session import (
-    Conditions,
-    Gauge,
-    Posture,
-    Reading,
-    ReadingKey,
-    Session,
-    Setup,
-)
+from orthocal.session.session import Conditions, Gauge, Posture, Reading, ReadingKey, Session, Setup
 from orthocal.text import list_some
 
 

@@ -10,15 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import (
-    BLANK,
-    MOST_CELLS,
-    MOST_COLUMNS,
-    MOST_ROWS,
-    Cell,
-    Row,
-    make_row,
-)
+from orthocal.io.tables.cell import BLANK, MOST_CELLS, MOST_COLUMNS, MOST_ROWS, Cell, Row, make_row
 from orthocal.text import shorten
 
 LARGEST_TEXT = 16 * 2**20

@@ -10,13 +10,7 @@ from typing import Any
 
 from orthocal.errors import SessionError
 from orthocal.io.tables.cell import BLANK, ZIP_SIGNATURE, MergedCells, Row, column_letters
-from orthocal.io.tables.delimited import (
-    HEADER_ROWS,
-    FindHeader,
-    decode,
-    find_separator,
-    split_rows,
-)
+from orthocal.io.tables.delimited import HEADER_ROWS, FindHeader, decode, find_separator, split_rows
 from orthocal.text import shorten
 
 

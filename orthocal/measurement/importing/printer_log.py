@@ -23,7 +23,7 @@ from orthocal.measurement.files.session_keys import LARGEST_READING_MM
 from orthocal.measurement.files.write_session import write_session
 from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmware
 from orthocal.printers.log import LogText, PrinterLog
-from orthocal.printers.settings import DeltaSettings, FirmwareName
+from orthocal.printers.settings import FirmwareName
 from orthocal.robot.model import Robot
 from orthocal.sensors.distance import Distance
 from orthocal.sensors.probe import Probe
@@ -202,16 +202,15 @@ def _posture(name: str, carriages: Array) -> Posture:
 
 
 def _robot(log: PrinterLog) -> Robot:
-    """Robot of nominal dimensions: equal rods, towers 120° apart, the firmware's radius."""
+    """Robot of nominal dimensions: equal rods, towers 120° apart, the firmware's radius.
+
+    Its travel contains all coordinates of the carriages.
+    """
+    settings = log.settings
     carriages = np.concatenate([log.carriages, *(d.carriages for d in log.distances)])
-    machine = _design(log.settings, carriages.min(), carriages.max())
+    machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
+    low = max(min(machine.travel[0], carriages.min() - TRAVEL_MARGIN), MM)
+    high = max(*settings.homed, carriages.max(), machine.zero) + TRAVEL_MARGIN
+    machine = replace(machine, travel=(round(float(low), 3), round(float(high), 3)))
     files = {f"{ROBOT}.urdf": machine.urdf(ROBOT), f"{ROBOT}.yaml": machine.yaml()}
     return load_robot_content(ROBOT, {name: text.encode() for name, text in files.items()})
-
-
-def _design(settings: DeltaSettings, lowest: float, highest: float) -> LinearDelta:
-    """Nominal dimensions, with a travel that contains all carriage coordinates, [m]."""
-    machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
-    low = max(min(machine.travel[0], lowest - TRAVEL_MARGIN), MM)
-    high = max(max(settings.homed), highest, machine.zero) + TRAVEL_MARGIN
-    return replace(machine, travel=(round(low, 3), round(high, 3)))
