@@ -276,7 +276,6 @@ def _prepare(
         aligned_over=_find_workspace(result),
     )
     interpreter = Interpreter(
-        file,
         axes=field.axes,
         offsets=controller.work_offsets,
         origin=result.session.controller_origin,
@@ -298,7 +297,7 @@ def _prepare(
         backlash=_describe_backlash(result, lags, by_program=by_program),
         interpreter=interpreter,
         corrector=ProgramCorrector(
-            interpreter, field, within=tolerance, region=region, sides=sides
+            interpreter, field, file=file, within=tolerance, region=region, sides=sides
         ),
         region=words,
         for_controller=_describe_controller(result, values, active=active),
