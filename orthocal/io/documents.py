@@ -332,9 +332,9 @@ _DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(
 def parse_number(
     text: str,
     *,
-    where: str,
     name: str,
     error: type[OrthocalError],
+    where: str | None = None,
     largest: float = LARGEST_NUMBER,
 ) -> float:
     """Finite number in a CSV field.

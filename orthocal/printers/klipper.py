@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from orthocal.arrays import Array, triple
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import LARGEST_NUMBER, parse_number
 from orthocal.printers.klipper_print import Distances, has_analysis, read_analysis, saved_distances
 from orthocal.printers.log import (
@@ -88,25 +88,26 @@ def _read_heights(source: LogText) -> PrinterLog:
     Raises:
         SessionError: If a line of the probe is damaged, or there are too few points.
     """
-    text, where = source.text, source.name
+    text = source.text
     files = " and ".join(name for name, _ in source.files)
     if runs := list(_RUN.finditer(text)):
         begin = runs[-1].start()
         probe = _probe_offset(_sections_before(text, begin), files)
-        return _read_run(runs[-1], probe, source.place(begin))
+        with errors_at(source.place(begin)):
+            return _read_run(runs[-1], probe)
     matches = sorted(
         [*_OLD_PROBE.finditer(text), *_NEW_PROBE.finditer(text)], key=lambda m: m.start()
     )
     _require_points(source)
     begin = 0 if has_analysis(source) and not matches else source.begin
-    steps = _saved_heights(_sections(text[begin:]), where)
+    steps = _saved_heights(_sections(text[begin:]), source.name)
     notes = []
     if steps is not None and matches and _first_saved(text) < matches[-1].start():
         notes.append(f"{len(steps[0])} saved heights are not used: they are older.")
     elif steps is not None:
         sections = _sections(text)
         settings = _settings(sections, files)
-        return _log_from_steps(*steps, settings, _step_lengths(sections, files), where)
+        return _log_from_steps(*steps, settings, _step_lengths(sections, files))
     points = np.array([_probed(m, source) for m in matches]).reshape(-1, 3) * MM
     positions = [m.start() for m in matches]
     used, of_probings = last_probing(points, positions, source)
@@ -118,7 +119,7 @@ def _read_heights(source: LogText) -> PrinterLog:
     name = _probe_section(sections)
     if "z_offset" not in sections.get(name, {}):
         notes.append(unstated_trigger(f"z_offset in [{name}]"))
-    return probed_log(settings, points[used], where=where, expected=EXPECTED, notes=notes)
+    return probed_log(settings, points[used], expected=EXPECTED, notes=notes)
 
 
 def _first_saved(text: str) -> int:
@@ -174,8 +175,8 @@ def _require_plausible(*values: object) -> None:
             raise ValueError
 
 
-def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
-    """Settings and triggers of a calculation in klippy.log; `line` is its file and line."""
+def _read_run(run: re.Match[str], probe: Array) -> PrinterLog:
+    """Settings and triggers of a calculation in klippy.log."""
     try:
         heights, lengths, values = (ast.literal_eval(v) for v in run.groups())
         distances = [(float(d), [[*map(float, p)], [*map(float, q)]]) for d, p, q in lengths]
@@ -187,20 +188,18 @@ def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
             [value[f"angle_{k}"] for k in TOWERS],
             [value[f"endstop_{k}"] for k in TOWERS],
             probe,
-            line,
         )
         steps = np.array([value[f"stepdist_{k}"] for k in TOWERS]) * MM
         _require_plausible(pairs, distances, [*value.values()])
     except _DAMAGED as e:
         raise SessionError(
             f"the calculation of delta_calibrate is damaged ({type(e).__name__}); expected lists "
-            "of heights, distances and parameters as Klipper writes them",
-            where=line,
+            "of heights, distances and parameters as Klipper writes them"
         ) from None
     # heights of the probe follow the manual ones, and all are its z_offset
     manual = [pair for pair in pairs if pair[0] != pairs[-1][0]]
     probed = [pair for pair in pairs if pair[0] == pairs[-1][0]]
-    return _log_from_steps(probed, manual, distances, settings, steps, line)
+    return _log_from_steps(probed, manual, distances, settings, steps)
 
 
 def _log_from_steps(
@@ -209,7 +208,6 @@ def _log_from_steps(
     distances: Distances,
     settings: DeltaSettings,
     steps: Array,
-    where: str,
 ) -> PrinterLog:
     """Log from stable positions.
 
@@ -219,7 +217,6 @@ def _log_from_steps(
         distances: Saved distances.
         settings: The settings.
         steps: Travel of each carriage per step, shape (3,), [m].
-        where: File and line, for messages.
     """
     notes, height = list[str](), settings.probe[2]
     if height and pairs and not pairs[-1][0]:  # METHOD=manual: the nozzle touched the bed
@@ -231,11 +228,11 @@ def _log_from_steps(
         )
     else:
         pairs = [*manual, *pairs]
-    require_points(len(pairs), where=where, expected=EXPECTED)
-    settings.require_plausible(where=where)
+    require_points(len(pairs), EXPECTED)
+    settings.require_plausible()
     stable = np.array([s for _, s in pairs])
     if stable.shape != (len(pairs), 3) or not np.isfinite(stable).all():
-        raise SessionError("expected three step counts per height", where=where)
+        raise SessionError("expected three step counts per height")
     if not settings.probe[2]:  # not stated: the height of the triggers replaces it
         settings = replace(settings, probe=(*settings.probe[:2], -pairs[-1][0] * MM))
     heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
@@ -245,7 +242,7 @@ def _log_from_steps(
         carriages,
         heights,
         (*notes, *unusual_content(settings, carriages)),
-        saved_distances(settings, steps, distances, where=where),
+        saved_distances(settings, steps, distances),
     )
 
 
@@ -274,10 +271,10 @@ def _saved_heights(sections: Sections, where: str) -> tuple[Pairs, Pairs, Distan
 
 def _saved_steps(saved: Mapping[str, str], key: str, where: str) -> list[float]:
     """Stable position of a key."""
-    where = f"{where}: [delta_calibrate] {key}"
-    position = numbers(saved.get(key, "").split(","), where=where, name="steps")
-    if len(position) != 3:
-        raise SessionError(f"found {len(position)} numbers; expected 3", where=where)
+    with errors_at(f"{where}: [delta_calibrate] {key}"):
+        position = numbers(saved.get(key, "").split(","), name="steps")
+        if len(position) != 3:
+            raise SessionError(f"found {len(position)} numbers; expected 3")
     return position
 
 
@@ -308,7 +305,8 @@ def _settings(sections: Sections, where: str) -> DeltaSettings:
         for name, design in zip(STEPPERS, DESIGN_ANGLES, strict=True)
     ]
     radius = _number(sections, "printer", "delta_radius", where)
-    return _with_endstops(radius, rods, angles, endstops, _probe_offset(sections, where), where)
+    with errors_at(where):
+        return _with_endstops(radius, rods, angles, endstops, _probe_offset(sections, where))
 
 
 def _with_endstops(
@@ -317,15 +315,13 @@ def _with_endstops(
     angles: list[float],
     endstops: list[float],
     probe: Array,
-    where: str,
 ) -> DeltaSettings:
     """Settings from Klipper's values in mm and degrees; the probe is in m."""
     for rod, k in zip(rods, TOWERS, strict=True):
         if not 0.0 < radius < rod:
             raise SessionError(
                 f"delta_radius is {radius:g}, arm_length of tower {k} {rod:g}; expected a positive "
-                "radius and longer rods",
-                where=where,
+                "radius and longer rods"
             )
     homed = [e + math.sqrt(rod**2 - radius**2) for e, rod in zip(endstops, rods, strict=True)]
     return DeltaSettings(

@@ -9,7 +9,6 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
@@ -112,13 +111,13 @@ class LogText:
         return f"{self.name}:{line + 1}"
 
 
-def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:
+def numbers(texts: Sequence[str], *, name: str, where: str | None = None) -> list[float]:
     """Parse texts as finite numbers.
 
     Args:
         texts: The texts.
-        where: File and line, for messages.
         name: Name of the numbers, for messages.
+        where: File and line, for messages.
 
     Raises:
         SessionError: If a text is not a finite number.
@@ -189,12 +188,11 @@ def _extends(probing: Array, other: Array) -> bool:
     return len(other) > len(probing) and all(map(_is_same_place, probing, other))
 
 
-def require_points(count: int, *, where: str, expected: str) -> None:
+def require_points(count: int, expected: str) -> None:
     """Refuse a log with too few or too many points.
 
     Args:
         count: Number of points.
-        where: Name of the log, for messages.
         expected: Description of a complete log, for the message.
 
     Raises:
@@ -203,8 +201,7 @@ def require_points(count: int, *, where: str, expected: str) -> None:
     if not MIN_POINTS <= count <= MAX_POINTS:
         number = count or "no"
         raise SessionError(
-            f"found {number} probed points; expected {MIN_POINTS} to {MAX_POINTS}: {expected}",
-            where=where,
+            f"found {number} probed points; expected {MIN_POINTS} to {MAX_POINTS}: {expected}"
         )
 
 
@@ -212,37 +209,31 @@ def probed_log(
     settings: DeltaSettings,
     nozzle: Array,
     *,
-    where: str,
     expected: str,
-    notes: Sequence[str] = (),
+    notes: Sequence[str],
 ) -> PrinterLog:
     """Log from positions of the nozzle at the triggers.
 
     Args:
         settings: The settings.
         nozzle: Positions in the firmware's coordinates, shape (K, 3), [m].
-        where: Name of the log, for messages.
         expected: Description of a complete log, for messages.
         notes: Notes on omitted and unusual content.
 
     Raises:
         SessionError: If the number of points is out of range, or a point is out of reach.
     """
-    require_points(len(nozzle), where=where, expected=expected)
+    require_points(len(nozzle), expected)
     if np.abs(nozzle).max() > LARGEST_COORDINATE:
         raise SessionError(
             f"found a point at {np.abs(nozzle).max() / MM:g} mm; expected at most "
-            f"{LARGEST_COORDINATE / MM:g} mm",
-            where=where,
+            f"{LARGEST_COORDINATE / MM:g} mm"
         )
-    settings.require_plausible(where=where)
+    settings.require_plausible()
     places = np.split(nozzle, _place_begins(nozzle)[1:])
     points = np.array([samples.mean(axis=0) for samples in places])
-    require_points(len(points), where=where, expected=expected)
-    try:
-        carriages = settings.inverse(points)
-    except SessionError as e:
-        raise SessionError(e.problem, where=where) from None
+    require_points(len(points), expected)
+    carriages = settings.inverse(points)
     notes = (*notes, *unusual_content(settings, carriages))
     return PrinterLog(settings, carriages, np.zeros(len(points)), notes)
 
@@ -324,10 +315,9 @@ def write_words(letters: str, values: Array) -> str:
 def settings_of_m665(
     firmware: FirmwareName,
     m665: Mapping[str, str],
-    rods: ArrayLike,
-    stops: ArrayLike,
+    rods: Array,
+    stops: Array,
     probe: Array,
-    where: str,
     *,
     raised: float = 0.0,
 ) -> DeltaSettings:
@@ -339,25 +329,23 @@ def settings_of_m665(
         rods: Lengths of the rods, shape (3,), [mm].
         stops: Heights of the endstops above H, shape (3,), [mm].
         probe: Tip of the probe at the trigger, from the nozzle, shape (3,), [m].
-        where: Name of the log, for messages.
         raised: Height of the zero of H above that of the nozzle, [m].
 
     Raises:
         SessionError: If a value is no number, or the rods are too short.
     """
-    radius, height = numbers([m665[k] for k in "RH"], where=where, name="M665")
-    turns = numbers([m665.get(k, "0") for k in "XYZ"], where=where, name="M665")
-    shortest = np.min(rods)
-    if not 0.0 < radius < shortest:
+    radius, height = numbers([m665[k] for k in "RH"], name="M665")
+    turns = numbers([m665.get(k, "0") for k in "XYZ"], name="M665")
+    if not 0.0 < radius < rods.min():
         raise SessionError(
-            f"M665 has R {radius:g} and rods from {shortest:g}; expected a positive radius and "
-            "longer rods",
-            where=where,
+            f"M665 has R {radius:g} and rods from {rods.min():g}; expected a positive radius and "
+            "longer rods"
         )
-    homed = (height + np.sqrt(np.square(rods) - radius**2) + stops) * MM - raised
+    homed = (height + np.sqrt(rods**2 - radius**2) + stops) * MM - raised
     angles = triple(DESIGN_ANGLES + np.array(turns) * DEG)
-    rods = triple(np.asarray(rods), MM)
-    return DeltaSettings(firmware, radius * MM, rods, triple(homed), angles, probe=triple(probe))
+    return DeltaSettings(
+        firmware, radius * MM, triple(rods, MM), triple(homed), angles, probe=triple(probe)
+    )
 
 
 def require_one_value(source: LogText, command: str, *, since: int = 0, until: int) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.printers.log import (
     DECIMALS,
     MIN_POINTS,
@@ -95,15 +95,15 @@ def read_log(source: LogText) -> PrinterLog:
         SessionError: If the text is invalid; names the line or the missing setting.
     """
     probing = _bed_points(source) or _table(source) or _grid(source)
-    text, where, notes = source.text, source.name, list(probing.notes)
+    text, notes = source.text, list(probing.notes)
     if not probing.at_nozzle:  # G33 changes settings, and prints those of the probing
         for command in ("M665", "M666", "M851"):
             require_one_value(source, command, since=probing.since, until=probing.until)
     m665, m666, m851 = (
         last_words(text, k) | last_words(text[: probing.until], k) for k in ("M665", "M666", "M851")
     )
-    x, y, z = numbers([m851.get(k, "0") for k in "XYZ"], where=where, name="M851")
-    settings = _settings(m665, m666, probing.g33, np.array([x, y, z]) * MM, where)
+    x, y, z = numbers([m851.get(k, "0") for k in "XYZ"], name="M851")
+    settings = _settings(m665, m666, probing.g33, np.array([x, y, z]) * MM)
     if (bed := _calibration_radius(m665)) is not None:
         notes.append(
             f"M665 B{bed:g} is the radius at which G33 of Marlin 1.1 probes, not a trim of a rod."
@@ -113,7 +113,7 @@ def read_log(source: LogText) -> PrinterLog:
     nozzle = (
         probing.points - [0.0, 0.0, z] if probing.at_nozzle else probing.points - [x, y, z]
     ) * MM
-    return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
+    return probed_log(settings, nozzle, expected=EXPECTED, notes=notes)
 
 
 def read_log_1(source: LogText) -> PrinterLog:
@@ -125,8 +125,7 @@ def read_log_1(source: LogText) -> PrinterLog:
     log = read_log(source)
     if len(set(log.settings.rods)) > 1:
         raise SessionError(
-            "M665 has trims A, B, C of rods, which Marlin 1.1 lacks; expected --format marlin",
-            where=source.name,
+            "M665 has trims A, B, C of rods, which Marlin 1.1 lacks; expected --format marlin"
         )
     return replace(log, settings=replace(log.settings, firmware="marlin1"))
 
@@ -175,7 +174,6 @@ def _settings(
     m666: Mapping[str, str],
     g33: re.Match[str] | None,
     probe: Array,
-    where: str,
 ) -> DeltaSettings:
     """Settings of M665 and M666; different settings that G33 printed replace them."""
     firmware = _firmware(m665)
@@ -185,20 +183,19 @@ def _settings(
     printed = {} if g33 is None else {k: v for k, v in g33.groupdict().items() if v is not None}
     for name, value in printed.items():
         key = {"E": f"E{name[-1].upper()}", "T": name[-1].upper()}.get(name[0], name)
-        stated = numbers([value, words.get(key, value)], where=where, name=name)
+        stated = numbers([value, words.get(key, value)], name=name)
         if key not in words or abs(stated[0] - stated[1]) > ROUNDING_TOLERANCE:
             words[key] = value
     for letter in "LRH":
         if letter not in words:
             raise SessionError(
                 f"has no M665 {letter}; expected the settings that M503 prints, with "
-                "M665 L R H X Y Z, M666 X Y Z and M851",
-                where=where,
+                "M665 L R H X Y Z, M666 X Y Z and M851"
             )
-    rod, *trims = numbers([words[k] for k in "LABC"], where=where, name="M665")
-    lowered = np.array(numbers([words[f"E{k}"] for k in "XYZ"], where=where, name="M666"))
+    rod, *trims = numbers([words[k] for k in "LABC"], name="M665")
+    lowered = np.array(numbers([words[f"E{k}"] for k in "XYZ"], name="M666"))
     return settings_of_m665(
-        firmware, words, rod + np.array(trims), -lowered, probe, where, raised=probe[2]
+        firmware, words, rod + np.array(trims), -lowered, probe, raised=probe[2]
     )
 
 
@@ -265,14 +262,11 @@ def _grid(source: LogText) -> _Probing:
     if not grids:
         return _Probing(np.zeros((0, 3)), 0, len(text), _last_g33(text, len(text)))
     grid = grids[-1]
-    where = source.place(grid.start())
-    rows = [
-        numbers(line.split()[1:], where=where, name="grid")
-        for line in grid["rows"].splitlines()
-        if line.strip()
-    ]
-    if len({len(row) for row in rows}) != 1:
-        raise SessionError("has rows of different lengths; expected a complete grid", where=where)
+    lines = [line.split()[1:] for line in grid["rows"].splitlines() if line.strip()]
+    with errors_at(source.place(grid.start())):
+        rows = [numbers(line, name="grid") for line in lines]
+        if len({len(row) for row in rows}) != 1:
+            raise SessionError("has rows of different lengths; expected a complete grid")
     distance, heights = _require_radius(source, "the grid"), np.array(rows)
     y, x = np.meshgrid(*(np.linspace(-distance, distance, n) for n in heights.shape), indexing="ij")
     points = np.column_stack([x.ravel(), y.ravel(), heights.ravel()])

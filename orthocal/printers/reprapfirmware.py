@@ -13,7 +13,7 @@ from typing import NoReturn
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.printers.log import (
     DECIMALS,
     NUMBER,
@@ -61,13 +61,14 @@ def read_log(source: LogText) -> PrinterLog:
     Raises:
         SessionError: If the text is invalid; names the line or the missing setting.
     """
-    text, where = source.text, source.name
+    text = source.text
     reports = list(_HEIGHTS.finditer(text))
     if not reports:
         _refuse_without_heights(source)
     report = reports[-1]
     line = source.place(report.start())
-    heights = _heights(report["values"], line)
+    with errors_at(line):
+        heights = _heights(report["values"])
     points = _points(source, report.start())
     if len(points) != len(heights):
         raise SessionError(
@@ -76,14 +77,14 @@ def read_log(source: LogText) -> PrinterLog:
             where=line,
         )
     g31 = last_words(text, "G31")
-    x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], where=where, name="G31")
+    x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], name="G31")
     nozzle = np.column_stack([points - [x, y], np.array(heights) + z]) * MM
     _require_settings_of(source, report.start())
-    settings = _settings(text, np.array([x, y, -z]) * MM, where)
+    settings = _settings(text, np.array([x, y, -z]) * MM)
     notes = [] if "Z" in g31 else [unstated_trigger("G31 Z")]
     if len(reports) > 1:
         notes.append(f"The log has {len(reports)} probings. The last one is used: {line}.")
-    return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
+    return probed_log(settings, nozzle, expected=EXPECTED, notes=notes)
 
 
 def _refuse_without_heights(source: LogText) -> NoReturn:
@@ -106,10 +107,10 @@ def _refuse_without_heights(source: LogText) -> NoReturn:
             f"found '{stopped[0]}' of a G30 without P, which states no place; expected {EXPECTED}",
             where=source.place(stopped.start()),
         )
-    raise SessionError(f"found no probed points; expected {EXPECTED}", where=source.name)
+    raise SessionError(f"found no probed points; expected {EXPECTED}")
 
 
-def _heights(text: str, where: str) -> list[float]:
+def _heights(text: str) -> list[float]:
     """Heights of a report, [mm].
 
     Raises:
@@ -118,10 +119,8 @@ def _heights(text: str, where: str) -> list[float]:
     words = re.findall(r"not set|probing failed|\S+", text)
     for number, word in enumerate(words):
         if word in ("not set", "probing failed"):
-            raise SessionError(
-                f"point P{number} has '{word}' in place of a height; probe again", where=where
-            )
-    return numbers(words, where=where, name="a bed probe height")
+            raise SessionError(f"point P{number} has '{word}' in place of a height; probe again")
+    return numbers(words, name="a bed probe height")
 
 
 def _require_settings_of(source: LogText, report: int) -> None:
@@ -174,7 +173,7 @@ def _points(source: LogText, report: int) -> Array:
     return np.array([places[k] for k in sorted(places)]).reshape(-1, 2)
 
 
-def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
+def _settings(text: str, probe: Array) -> DeltaSettings:
     """Settings of commands; reports of M665 and M666 replace them."""
     m665, m666 = last_words(text, "M665"), last_words(text, "M666")
     for words, pattern in ((m665, _M665), (m666, _M666)):
@@ -184,14 +183,13 @@ def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
         if letter not in m665:
             raise SessionError(
                 f"has no M665 {letter}; expected M665 L R H of config.g or config-override.g "
-                "(--settings), or the report of M665 without parameters",
-                where=where,
+                "(--settings), or the report of M665 without parameters"
             )
-    rods = numbers(m665["L"].split(":"), where=where, name="M665 L")
+    rods = numbers(m665["L"].split(":"), name="M665 L")
     rods = rods if len(rods) == 3 else [rods[0]] * 3
-    stops = numbers([m666.get(k, "0") for k in "XYZ"], where=where, name="M666")
-    a, b = numbers([m666.get(k, "0") for k in "AB"], where=where, name="M666")
-    settings = settings_of_m665("reprapfirmware", m665, rods, stops, probe, where)
+    stops = numbers([m666.get(k, "0") for k in "XYZ"], name="M666")
+    a, b = numbers([m666.get(k, "0") for k in "AB"], name="M666")
+    settings = settings_of_m665("reprapfirmware", m665, np.array(rods), np.array(stops), probe)
     return replace(settings, tilts=(a / 100.0, b / 100.0))
 
 

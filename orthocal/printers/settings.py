@@ -141,17 +141,14 @@ class DeltaSettings:
         """Positions of the probe's tip at coordinates of the carriages (K, 3), (K, 3), [m]."""
         return np.asarray(self.forward(carriages) + self.probe)
 
-    def require_plausible(self, *, where: str) -> None:
+    def require_plausible(self) -> None:
         """Refuse implausible settings, such as the result of a failed fit.
-
-        Args:
-            where: Name of the file, for messages.
 
         Raises:
             SessionError: If a setting is implausible; names it.
         """
         if problem := self.find_problem():
-            raise SessionError(problem, where=where)
+            raise SessionError(problem)
 
     def find_problem(self) -> str:
         """First implausible setting, and what is expected; empty if all are plausible."""

@@ -15,7 +15,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.effects.loading import load_robot_content
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import exists
@@ -124,7 +124,8 @@ def import_printer_log(
             f"{', '.join(FIRMWARES)}",
             where=str(log),
         )
-    content = FIRMWARES[name].read_log(source)
+    with errors_at(source.name):
+        content = FIRMWARES[name].read_log(source)
     return PrinterImport(content, _session(content, Path(log)))
 
 
