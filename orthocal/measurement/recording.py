@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import OrthocalError, OutputError, SessionError
+from orthocal.errors import OrthocalError, OutputError, SessionError, errors_at
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
 from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of, value_name
@@ -204,21 +204,18 @@ class Recording:
         for row, setup in zip(rows, setups, strict=True):
             along = getattr(setup.sensor, "along", None)
             reading = to_mm(float(value if along is None else np.dot(along, value)))
-            check_range(
-                reading,
-                self.session.gauges[setup.gauge],
-                difference=self.session.is_difference(row),
-                where=row.label_with_cycle,
-                name=value_name(row.setup),
-                largest=largest_reading(setup.sensor),
-                of_setup_mm=[r.value / MM for r in self.rows if r.setup == row.setup and r.is_read],
-            )
-            check_conditions(
-                conditions,
-                self.session.robot,
-                two_postures=row.minus is not None,
-                where=row.label_with_cycle,
-            )
+            of_setup_mm = [r.value / MM for r in self.rows if r.setup == row.setup and r.is_read]
+            with errors_at(row.label_with_cycle):
+                check_range(
+                    reading,
+                    self.session.gauges[setup.gauge],
+                    difference=self.session.is_difference(row),
+                    name=value_name(row.setup),
+                    largest=largest_reading(setup.sensor),
+                    of_setup_mm=of_setup_mm,
+                )
+                two_postures = row.minus is not None
+                check_conditions(conditions, self.session.robot, two_postures=two_postures)
             readings_mm.append(round(reading, DECIMALS))
         stated = _conditions_to_state(rows[0], conditions)
         keys: list[ReadingKey] = [row.key for row in rows]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import parse_number
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.point_rows import PointRows, value_name
@@ -68,9 +68,10 @@ def check_readings(
     needs_approach = "approach" in needed_conditions(session.robot)
     accepted, points = _AcceptedReadings(file, needs_approach=needs_approach), PointRows(session)
     for row in rows:
-        for reading in parse_row(row, session, points):
-            setup = points.setups[reading.setup]
-            accepted.add(row, reading, of_pair=reads_pairs(setup.sensor))
+        with errors_at(row.where):
+            for reading in parse_row(row, session, points):
+                setup = points.setups[reading.setup]
+                accepted.add(row, reading, of_pair=reads_pairs(setup.sensor))
     if not accepted.readings:
         raise SessionError("holds no readings", where=str(file))
     out_of_range = _find_out_of_range(accepted, points)
@@ -101,13 +102,12 @@ def _find_out_of_range(accepted: _AcceptedReadings, points: PointRows) -> dict[s
                 reading.value / MM,
                 points.gauges[setup.gauge],
                 difference=is_difference(reading.minus, setup.sensor),
-                where=place,
                 name=value_name(reading.setup),
                 largest=largest_reading(setup.sensor),
                 of_setup_mm=of_setup_mm.get(reading.setup, ()),
             )
         except SessionError as e:
-            errors.setdefault(place, e)
+            errors.setdefault(place, SessionError(e.problem, where=place))
     return errors
 
 
@@ -163,27 +163,25 @@ def parse_row(row: RawReading, session: Session, points: PointRows) -> list[Read
     Raises:
         SessionError: If the row contradicts the session; names file and line.
     """
-    _check_names(row, session, points)
-    columns = COORDINATES if points.is_point(row) else ("reading_mm",)
-    values = [_parse_value(row, column) * MM for column in columns]
-    missing = [c for c, v in zip(columns, values, strict=True) if math.isnan(v)]
-    if missing and len(missing) < len(values):
-        raise SessionError(
-            f"{missing[0]} is empty; expected all three coordinates of the point", where=row.where
-        )
-    cycle, conditions = parse_cycle(row.cycle, row.where), parse_conditions(row, session.robot)
-    value_by_setup = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
+    with errors_at(row.where):
+        _check_names(row, session, points)
+        columns = COORDINATES if points.is_point(row) else ("reading_mm",)
+        values = [_parse_value(getattr(row, column), column) * MM for column in columns]
+        missing = [c for c, v in zip(columns, values, strict=True) if math.isnan(v)]
+        if missing and len(missing) < len(values):
+            raise SessionError(
+                f"{missing[0]} is empty; expected all three coordinates of the point"
+            )
+        cycle, conditions = parse_cycle(row.cycle), parse_conditions(row, session.robot)
+        by_setup = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
     return [
         Reading(name, row.posture, row.minus or None, cycle, value, row.line, conditions=conditions)
-        for name, value in value_by_setup.items()
+        for name, value in by_setup.items()
     ]
 
 
-def _parse_value(row: RawReading, column: str) -> float:
-    text = getattr(row, column)
-    if not text:
-        return math.nan
-    return parse_number(text, where=row.where, name=column, error=SessionError)
+def _parse_value(text: str, column: str) -> float:
+    return parse_number(text, name=column, error=SessionError) if text else math.nan
 
 
 class _AcceptedReadings:
@@ -213,16 +211,16 @@ class _AcceptedReadings:
             of_pair: Whether the sensor reads pairs of postures; these readings are independent.
 
         Raises:
-            SessionError: If the reading disagrees with the previous ones; names file and line.
+            SessionError: If the reading disagrees with the previous ones.
         """
         if reading.key in self._first_lines:
-            raise SessionError(self._describe_repetition(reading), where=row.where)
+            raise SessionError(self._describe_repetition(reading))
         self._first_lines[reading.key] = row.line
         self._require_consistent_time_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
         if not of_pair:
-            self._independent.add(reading, row.where)
+            self._independent.add(reading)
         self.readings.append(reading)
         self.places.append(row.where)
 
@@ -250,27 +248,23 @@ class _AcceptedReadings:
         if len(self._first_line_by_zoned) > 1:
             raise SessionError(
                 f"time is '{row.time}'; expected all times of a session with a time zone, or all "
-                f"without one, as in line {self._first_line_by_zoned[not zoned]}",
-                where=row.where,
+                f"without one, as in line {self._first_line_by_zoned[not zoned]}"
             )
 
 
 def _check_names(row: RawReading, session: Session, points: PointRows) -> None:
     """Refuse a setup or postures that the session does not have, and cells of other sensors."""
-    require_name(row.setup, points.names, "setup", where=row.where)
+    require_name(row.setup, points.names, "setup")
     points.check_columns(row)
     for name in (row.posture, row.minus) if row.minus else (row.posture,):
-        require_name(name, session.postures, "posture", where=row.where)
+        require_name(name, session.postures, "posture")
     if row.minus == row.posture:
-        raise SessionError(
-            f"posture and minus are both '{row.posture}'; expected two postures", where=row.where
-        )
+        raise SessionError(f"posture and minus are both '{row.posture}'; expected two postures")
     setup = session.setups.get(row.setup)
     if setup is not None and reads_pairs(setup.sensor) and not row.minus:
         raise SessionError(
             f"minus is empty; expected the second posture of the pair: setup {row.setup} has a "
-            f"{setup.sensor.describe()}",
-            where=row.where,
+            f"{setup.sensor.describe()}"
         )
 
 
@@ -278,7 +272,7 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
     """Conditions of a row; None if it states none.
 
     Raises:
-        SessionError: If a condition is wrong; names file, line and column.
+        SessionError: If a condition is wrong; names the column.
     """
     stated = {column: text for column in CONDITIONS if (text := getattr(row, column))}
     if not stated:
@@ -287,65 +281,58 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
         column, text = next(iter(stated.items()))
         raise SessionError(
             f"{column} is '{shorten(text)}'; expected an empty cell: the row has two postures, and "
-            "conditions belong to readings in one posture",
-            where=row.where,
+            "conditions belong to readings in one posture"
         )
     conditions = Conditions(
         row.approach or None,
-        parse_temperature(row.temperature_C, row.where) if row.temperature_C else None,
-        parse_time(row.time, row.where) if row.time else None,
+        parse_temperature(row.temperature_C) if row.temperature_C else None,
+        parse_time(row.time) if row.time else None,
     )
-    check_conditions(conditions, robot, two_postures=False, where=row.where)
+    check_conditions(conditions, robot, two_postures=False)
     return conditions
 
 
-def check_conditions(
-    conditions: Conditions, robot: Robot, *, two_postures: bool, where: str
-) -> None:
+def check_conditions(conditions: Conditions, robot: Robot, *, two_postures: bool) -> None:
     """Refuse conditions that a reading cannot have.
 
     Args:
         conditions: The conditions.
         robot: The robot.
         two_postures: Whether the reading belongs to two postures.
-        where: File and line, or name of the reading, for messages.
 
     Raises:
         SessionError: If the reading cannot have the conditions.
     """
     if two_postures and conditions != Conditions():
-        raise SessionError(
-            "has two postures; conditions belong to readings in one posture", where=where
-        )
+        raise SessionError("has two postures; conditions belong to readings in one posture")
     approach = conditions.approach
     if approach is not None and (problem := find_approach_problem(approach, robot)):
-        raise SessionError(f"approach is {problem}", where=where)
+        raise SessionError(f"approach is {problem}")
     if conditions.temperature is not None:
-        _require_temperature(conditions.temperature, where)
+        _require_temperature(conditions.temperature)
 
 
-def parse_temperature(text: str, where: str) -> float:
+def parse_temperature(text: str) -> float:
     """Temperature, [°C].
 
     Raises:
         SessionError: If the text is not a number from LOWEST_C to HIGHEST_C.
     """
-    value = parse_number(text, where=where, name="temperature_C", error=SessionError)
-    _require_temperature(value, where)
+    value = parse_number(text, name="temperature_C", error=SessionError)
+    _require_temperature(value)
     return value
 
 
-def _require_temperature(value: float, where: str) -> None:
+def _require_temperature(value: float) -> None:
     """Refuse a temperature, [°C], that no workshop has."""
     if not LOWEST_C <= value <= HIGHEST_C:
         raise SessionError(
             f"temperature_C is {value:g}; expected degrees Celsius from {LOWEST_C:g} to "
-            f"{HIGHEST_C:g}",
-            where=where,
+            f"{HIGHEST_C:g}"
         )
 
 
-def parse_time(text: str, where: str) -> datetime:
+def parse_time(text: str) -> datetime:
     """Date and time of day.
 
     Raises:
@@ -358,12 +345,11 @@ def parse_time(text: str, where: str) -> datetime:
     except ValueError:
         raise SessionError(
             f"time is '{shorten(text)}'; expected date and time of ISO 8601, such as "
-            "2025-03-14T09:26:53 or 2025-03-14T09:26:53+01:00",
-            where=where,
+            "2025-03-14T09:26:53 or 2025-03-14T09:26:53+01:00"
         ) from None
 
 
-def parse_cycle(text: str, where: str) -> int:
+def parse_cycle(text: str) -> int:
     """Cycle of a row; 1 if its cell is empty.
 
     Raises:
@@ -372,7 +358,7 @@ def parse_cycle(text: str, where: str) -> int:
     if not text:
         return 1
     if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= 1):
-        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...", where=where)
+        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...")
     return int(text)
 
 
@@ -381,7 +367,6 @@ def check_range(
     gauge: Gauge,
     *,
     difference: bool,
-    where: str,
     name: str,
     largest: float,
     of_setup_mm: ArrayLike,
@@ -392,7 +377,6 @@ def check_range(
         value_mm: Reading, [mm].
         gauge: The gauge.
         difference: Whether the reading is a difference of two postures.
-        where: File and line, or name of the reading, for messages.
         name: Name of the value, for messages.
         largest: Largest reading of the kind of sensor, [m].
         of_setup_mm: Readings of the setup, [mm]. If most are in range, a larger reading may have a
@@ -424,4 +408,4 @@ def check_range(
     else:
         kind = "a difference" if difference else "a reading"
         expected = f"the gauge's range allows {kind} from {limits}{hint}"
-    raise SessionError(f"{name} is {value_mm:g}; {expected}", where=where)
+    raise SessionError(f"{name} is {value_mm:g}; {expected}")

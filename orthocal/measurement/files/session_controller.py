@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.effects.compensation import Compensation, JointTrim, with_homes
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.fields import read_only
 from orthocal.measurement.files.linuxcnc_ini import read_comp_file
 from orthocal.measurement.files.session_keys import ControllerKeys, Quantity, drive_value_keys
@@ -26,7 +26,6 @@ def require_count(
     noun: str,
     drives: Sequence[Drive],
     *,
-    where: str,
     each: str = "drive",
     remark: str = "",
 ) -> None:
@@ -36,7 +35,6 @@ def require_count(
         values: The list.
         noun: Name of its items in the plural.
         drives: The drives.
-        where: File and key, for messages.
         each: Kind of the drives.
         remark: End of the message.
 
@@ -46,8 +44,7 @@ def require_count(
     if len(values) != len(drives):
         names = ", ".join(d.name for d in drives)
         raise SessionError(
-            f"has {len(values)} {noun}; expected {len(drives)}, one per {each}: {names}{remark}",
-            where=where,
+            f"has {len(values)} {noun}; expected {len(drives)}, one per {each}: {names}{remark}"
         )
 
 
@@ -94,15 +91,14 @@ def build_compensation(
             )
         return ()
     names = keys.comp_file or [None] * len(robot.drives)
-    table_key = f"{where}.comp_file"
-    remark = "; null for a drive without a table"
-    require_count(names, "names", robot.drives, where=table_key, remark=remark)
-    values = np.zeros(len(names)) if backlash is None else backlash
-    tables = (
-        None if name is None else read_comp_file(folder, name, drive, table_key)
-        for name, drive in zip(names, robot.drives, strict=True)
-    )
-    trims = [JointTrim(float(v), table) for v, table in zip(values, tables, strict=True)]
+    with errors_at(f"{where}.comp_file"):
+        remark = "; null for a drive without a table"
+        require_count(names, "names", robot.drives, remark=remark)
+        values = np.zeros(len(names)) if backlash is None else backlash
+        trims = [
+            JointTrim(float(v), None if name is None else read_comp_file(folder, name, drive))
+            for v, name, drive in zip(values, names, robot.drives, strict=True)
+        ]
     return with_homes(trims, None if homes is None else homes.tolist())
 
 
@@ -148,19 +144,12 @@ def _read_drive_values(
     for key in stated:
         values, (unit, factor) = getattr(keys, key), key_units[key]
         indices = [i for i, d in enumerate(robot.drives) if d.unit == unit]
-        if not indices:
-            expected = " or ".join(k for k, (u, _) in key_units.items() if u != unit)
-            raise SessionError(
-                f"{robot.name} has no {KINDS[unit]} drive; expected {expected}",
-                where=f"{where}.{key}",
-            )
-        require_count(
-            values,
-            "numbers",
-            [robot.drives[i] for i in indices],
-            where=f"{where}.{key}",
-            each="drive" if len(indices) == len(robot.drives) else f"{KINDS[unit]} drive",
-        )
+        with errors_at(f"{where}.{key}"):
+            if not indices:
+                expected = " or ".join(k for k, (u, _) in key_units.items() if u != unit)
+                raise SessionError(f"{robot.name} has no {KINDS[unit]} drive; expected {expected}")
+            each = "drive" if len(indices) == len(robot.drives) else f"{KINDS[unit]} drive"
+            require_count(values, "numbers", [robot.drives[i] for i in indices], each=each)
         result[indices] = np.array(values) * factor
         units.add(unit)
     for drive in robot.drives:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError, SessionError, UnreachablePostureError
+from orthocal.errors import ClosureError, SessionError, UnreachablePostureError, errors_at
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.session_controller import KINDS, require_count
@@ -88,25 +88,22 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
     """Form and coordinates of a posture, shape (n_drives,), [m, rad]."""
     key, values = keys.stated
     count = len(robot.drives)
-    if key == "tcp_mm":
-        if not robot.commands_tool:
-            raise SessionError(
-                f"{robot.name} has no tool coordinate for every drive; use {_usable_key(robot)}",
-                where=where,
-            )
-        if len(values) != count:
-            raise SessionError(
-                f"has {len(values)} coordinates; expected {count}", where=f"{where}.{key}"
-            )
-        return "tcp", np.array(values) * MM
-    where = f"{where}.{key}"
-    require_count(values, "numbers", robot.drives, where=where)
-    unit = "m" if key == "joints_mm" else "rad"
-    for drive in robot.drives:
-        if drive.unit != unit:
-            raise SessionError(
-                f"drive {drive.name} is {KINDS[drive.unit]}; use {_usable_key(robot)}", where=where
-            )
+    if key == "tcp_mm" and not robot.commands_tool:
+        raise SessionError(
+            f"{robot.name} has no tool coordinate for every drive; use {_usable_key(robot)}",
+            where=where,
+        )
+    with errors_at(f"{where}.{key}"):
+        if key == "tcp_mm":
+            if len(values) != count:
+                raise SessionError(f"has {len(values)} coordinates; expected {count}")
+            return "tcp", np.array(values) * MM
+        require_count(values, "numbers", robot.drives)
+        unit = "m" if key == "joints_mm" else "rad"
+        for drive in robot.drives:
+            if drive.unit != unit:
+                usable = _usable_key(robot)
+                raise SessionError(f"drive {drive.name} is {KINDS[drive.unit]}; use {usable}")
     return "joints", np.array(values) * MM if unit == "m" else np.deg2rad(values)
 
 

@@ -228,7 +228,7 @@ def _without_clock_times(table: Table, columns: Columns) -> Columns:
     try:
         for text in texts:
             if text:
-                parse_time(text, "")
+                parse_time(text)
     except SessionError:
         single = {role: i for role, i in columns.single.items() if i != time_column}
         return replace(columns, single=single, extra=tuple(sorted((*columns.extra, time_column))))
@@ -271,7 +271,7 @@ def _is_filled(row: RawReading) -> bool:
 
 
 def _key(row: RawReading) -> Key:
-    return row.setup, row.posture, row.minus, parse_cycle(row.cycle, row.where)
+    return row.setup, row.posture, row.minus, parse_cycle(row.cycle)
 
 
 def _merge(
