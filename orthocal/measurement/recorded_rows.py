@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.io.documents import Keys, Number, validate
 from orthocal.io.journal import Journal
-from orthocal.measurement.files.session_keys import LARGEST_READING_MM
+from orthocal.measurement.files.session_keys import ReadingLimit
 from orthocal.sensors.points import Coordinate
 from orthocal.session.points import base_name
 from orthocal.session.session import Conditions, Reading, ReadingKey, Session, known_approach
@@ -34,9 +34,7 @@ class Change(Keys):
     change together."""
     rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
     """Keys of the row, or of the three rows of a point, then of as many added rows."""
-    reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
-        None
-    )
+    reading_mm: ReadingLimit | None = None
     point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
     """Readings of the three rows of a point."""
     conditions: Conditions | None = None

@@ -60,7 +60,7 @@ FARTHEST_ORIGIN_MM = 1e5
 OriginCoordinate = Annotated[Number, Field(ge=-FARTHEST_ORIGIN_MM, le=FARTHEST_ORIGIN_MM)]
 
 GaugeNoise = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
-RangeLimit = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
+ReadingLimit = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
 
 Adjusted = Annotated[Number, Field(ge=-LARGEST_AMOUNT_MM, le=LARGEST_AMOUNT_MM)]
 
@@ -77,7 +77,7 @@ class GaugeKeys(Keys):
     sigma_mm: GaugeNoise | None = None
     """Standard deviation of a reading."""
     resolution_mm: GaugeNoise | None = None
-    range_mm: Annotated[list[RangeLimit], Field(min_length=2, max_length=2)] | None = None
+    range_mm: Annotated[list[ReadingLimit], Field(min_length=2, max_length=2)] | None = None
     """Lowest and highest reading."""
     tip: TipKeys | None = None
     """Tip; a setup may override it."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.strict_yaml import LONGEST_NUMBER
 from orthocal.io.tables.cell import Cell, Row
 from orthocal.io.tables.numerals import (
@@ -151,8 +151,9 @@ def make_long_table(
         if length.number is None:
             rows.skip(length)
             continue
-        value = _parse_value(length, sign.sign)
-        rows.add(length, value, _choose_unit(length, unit, table.header[length.column]))
+        with errors_at(length.row.where):
+            value = _parse_value(length, sign.sign)
+            rows.add(length, value, _choose_unit(length, unit, table.header[length.column]))
     return LongTable(
         rows=rows.located(points or {}),
         missing=tuple(r for r in rows.missing if (r.line, r.cycle) not in rows.by_place),
@@ -326,12 +327,11 @@ def _read_lengths(
                 if heading.role not in NOMINAL:
                     yield length
                 continue
-            number, value, unit = _read_number(row.cell(i), where)
-            stated = heading.unit or units_below.get(i)
-            if unit and stated and unit != stated:
-                raise SessionError(
-                    f"the reading is in {unit}, and its heading says {stated}", where=where
-                )
+            with errors_at(where):
+                number, value, unit = _read_number(row.cell(i))
+                stated = heading.unit or units_below.get(i)
+                if unit and stated and unit != stated:
+                    raise SessionError(f"the reading is in {unit}, and its heading says {stated}")
             yield replace(length, number=number, value=value, unit=unit or stated)
 
 
@@ -455,16 +455,14 @@ _NOT_A_NUMBER = {
 }
 
 
-def _read_number(cell: Cell, where: str) -> tuple[str, Decimal | None, UnitName | None]:
+def _read_number(cell: Cell) -> tuple[str, Decimal | None, UnitName | None]:
     """Text, value and unit of the number of a cell; value and unit are None if not known.
 
     Raises:
         SessionError: If the cell is a date, a Boolean, an unsaved formula or a percentage.
     """
     if cell.kind in _NOT_A_NUMBER:
-        raise SessionError(
-            f"the reading {_NOT_A_NUMBER[cell.kind].format(shorten(cell.text))}", where=where
-        )
+        raise SessionError(f"the reading {_NOT_A_NUMBER[cell.kind].format(shorten(cell.text))}")
     if cell.kind == "number":
         return cell.text, cell.number, parse_unit(cell.unit)
     text = tidy_text(cell.text)
@@ -499,25 +497,19 @@ def _parse_value(length: LengthCell, sign: Sign) -> Decimal:
         hint = ""
         if any(parse_numeral(number, s) is not None for s in ("point", "comma")):
             hint = f" with a decimal {sign}"
-        raise SessionError(
-            f"the reading is '{shorten(number)}'; expected a number{hint}", where=length.row.where
-        )
+        raise SessionError(f"the reading is '{shorten(number)}'; expected a number{hint}")
     return value
 
 
 def _choose_unit(length: LengthCell, stated: UnitName | None, heading: str) -> UnitName:
     """Unit of a cell or its heading, or the unit of the option `--unit`."""
-    where = length.row.where
     if stated and length.unit and stated != length.unit:
-        raise SessionError(
-            f"the reading is in {length.unit}, which contradicts --unit {stated}", where=where
-        )
+        raise SessionError(f"the reading is in {length.unit}, which contradicts --unit {stated}")
     unit = length.unit or stated
     if unit is None:
         raise SessionError(
             f"neither the heading '{shorten(' '.join(heading.split()))}' nor the cell has a unit; "
-            "state it by --unit mm, um, inch or hundredths",
-            where=where,
+            "state it by --unit mm, um, inch or hundredths"
         )
     return unit
 
