@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from decimal import Decimal
@@ -22,12 +22,9 @@ from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, read_text
 from orthocal.io.tables.cell import ZIP_SIGNATURE, Row
 from orthocal.io.tables.delimited import SEPARATORS, decode, stated_separator
 from orthocal.io.tables.numerals import (
-    DecimalSign,
     Numeral,
     Sign,
-    UnknownSign,
-    format_decimal,
-    infer_decimal_sign,
+    decide_decimal_sign,
     parse_numeral,
     plain_minus,
 )
@@ -151,62 +148,6 @@ def _schema(header: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     if not set(COORDINATES) & set(header):
         return REQUIRED, OPTIONAL
     return REQUIRED_OF_POINTS, tuple(name for name in COLUMNS if name not in REQUIRED_OF_POINTS)
-
-
-def decide_decimal_sign(
-    cells: Sequence[Numeral], *, standard: bool, advice: str, place: Callable[[int], str]
-) -> DecimalSign:
-    """Common decimal sign (point or comma) of the readings of a table.
-
-    Args:
-        cells: The readings.
-        standard: Whether the headings are those of a readings.csv; then a point is a decimal point.
-        advice: Action for the user in case of an ambiguous sign.
-        place: Function from a line to file and line, for messages.
-
-    Raises:
-        SessionError: If both signs are possible, or both occur.
-    """
-    inferred = infer_decimal_sign(cells)
-    ambiguous = [c for c in cells if _is_ambiguous(c.text)]
-    if standard:
-        points = [c for c in ambiguous if "," not in c.text]
-        ambiguous = [c for c in ambiguous if "," in c.text]
-        if isinstance(inferred, DecimalSign) and inferred.sign == "comma" and points:
-            commas = [c for c in cells if _requires_comma(c.text)]
-            rare, frequent = sorted((points, commas), key=len)
-            inferred = UnknownSign(rare[0], frequent[0])
-    if isinstance(inferred, DecimalSign):
-        return inferred
-    if inferred.evidence is not None:
-        rival, other = inferred.rival, inferred.evidence
-        signs = ("point", "comma") if _requires_comma(other.text) else ("comma", "point")
-        raise SessionError(
-            f"the reading '{shorten(rival.text)}' has a decimal {signs[0]}, and "
-            f"'{shorten(other.text)}' in line {other.line} a decimal {signs[1]}; use one decimal "
-            "sign",
-            where=place(rival.line),
-        )
-    if not ambiguous:
-        return DecimalSign("point", None)
-    text = ambiguous[0].text
-    comma, point = parse_numeral(text, "comma"), parse_numeral(text, "point")
-    raise SessionError(
-        f"the reading '{text}' is {format_decimal(comma)} with a decimal comma and "
-        f"{format_decimal(point)} with a decimal point, and no other reading decides; {advice}",
-        where=place(ambiguous[0].line),
-    )
-
-
-def _requires_comma(text: str) -> bool:
-    """True for a numeral that is a number with a decimal comma only."""
-    return parse_numeral(text, "point") is None and parse_numeral(text, "comma") is not None
-
-
-def _is_ambiguous(text: str) -> bool:
-    """True for a numeral with different values for decimal comma and decimal point."""
-    comma, point = parse_numeral(text, "comma"), parse_numeral(text, "point")
-    return comma is not None and point is not None and comma != point
 
 
 def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:

@@ -22,6 +22,7 @@ from orthocal.io.tables.numerals import (
     DecimalSign,
     Numeral,
     Sign,
+    decide_decimal_sign,
     is_missing,
     parse_numeral,
     plain_minus,
@@ -30,7 +31,6 @@ from orthocal.io.tables.numerals import (
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import (
     RawReading,
-    decide_decimal_sign,
     format_mm,
     has_standard_headings,
     require_unsplit_numbers,
