@@ -283,29 +283,44 @@ def csv_rows(
         problem = "is blank" if any(line.strip() for line in lines) else "is empty"
         raise SessionError(f"{problem}; expected a header: {','.join(required)}", where=f"{name}:1")
     delimiter = ";" if "," not in first_line and ";" in first_line else ","
-    reader = csv.reader(
-        chain([first_line], lines), delimiter=delimiter, skipinitialspace=True, strict=True
-    )
+    rows = csv_cells(chain([first_line], lines), delimiter, name=name, most=most)
+    header = [composed(cell.strip()) for cell in next(rows)[1]]
+    if invalid := _header_problem(header, required, optional):
+        raise SessionError(invalid, where=f"{name}:1")
+    read = [(i, c) for i, c in enumerate(header) if optional is not None or c in required]
+    for line, row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            maybe_comma = delimiter == "," and len(row) > len(header)
+            hint = "; a decimal comma? write a point" if maybe_comma else ""
+            raise SessionError(
+                f"has {len(row)} fields; expected {len(header)} ({delimiter.join(header)}){hint}",
+                where=f"{name}:{line}",
+            )
+        yield line, {c: composed(row[i].strip()) for i, c in read}
+
+
+def csv_cells(
+    lines: Iterable[str], delimiter: str, *, name: str, most: int | None
+) -> Iterator[tuple[int, list[str]]]:
+    """Last line and cells of each row of a CSV file.
+
+    Args:
+        lines: Lines with their line ends.
+        delimiter: Character between cells.
+        name: Name of the file, for messages.
+        most: Largest number of lines; None for any number.
+
+    Raises:
+        SessionError: If quotes do not match, or there are more lines; names file and line.
+    """
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
-        header = [composed(cell.strip()) for cell in next(reader)]
-        if invalid := _header_problem(header, required, optional):
-            raise SessionError(invalid, where=f"{name}:1")
-        read = [(i, c) for i, c in enumerate(header) if optional is not None or c in required]
-        for row in reader:
-            line = reader.line_num
-            if most is not None and line > most:
+        for cells in reader:
+            if most is not None and reader.line_num > most:
                 raise SessionError(f"has more than {most} rows", where=name)
-            if not any(cell.strip() for cell in row):
-                continue
-            if len(row) != len(header):
-                maybe_comma = delimiter == "," and len(row) > len(header)
-                hint = "; a decimal comma? write a point" if maybe_comma else ""
-                raise SessionError(
-                    f"has {len(row)} fields; expected {len(header)} "
-                    f"({delimiter.join(header)}){hint}",
-                    where=f"{name}:{line}",
-                )
-            yield line, {c: composed(row[i].strip()) for i, c in read}
+            yield reader.line_num, cells
     except csv.Error as e:
         raise SessionError(f"is not valid CSV: {e}", where=f"{name}:{reader.line_num}") from None
 

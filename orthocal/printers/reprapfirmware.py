@@ -134,19 +134,16 @@ def _require_settings_of(source: LogText, report: int) -> None:
         SessionError: Naming the line of the calibration.
     """
     text = source.text
-    stated = [m.start() for pattern in (_M665, _M666) for m in pattern.finditer(text)]
+    stated = [[m.start() for m in pattern.finditer(text)] for pattern in (_M665, _M666)]
     for match in _CALIBRATED.finditer(text):
         place, at = source.place(match.start()), match.start()
-        if at > report and any(p > at for p in stated):
+        if at > report and any(p > at for positions in stated for p in positions):
             raise SessionError(
                 "changed the settings after the heights, and M665 or M666 reported the new ones; "
                 "expected only the settings during the probing",
                 where=place,
             )
-        reported = all(
-            any(at < m.start() < report for m in pattern.finditer(text))
-            for pattern in (_M665, _M666)
-        )
+        reported = all(any(at < p < report for p in positions) for positions in stated)
         if at < report and not reported:
             raise SessionError(
                 "changed the settings before the heights; expected the answers of M665 and M666 "

@@ -140,11 +140,9 @@ def bin_trace(trace: Trace) -> BinnedTrace:
         std = float(np.sqrt(np.mean([variance for _, _, variance in fits])))
         values = np.array([value for value, _, _ in fits])
         counts = [len(run_bins) for run_bins in bins_by_run]
-        if _averaging_error(values, counts, std) <= MAX_AVERAGING_ERROR * std:
-            break
-        if max(counts) >= MOST_BINS:
-            break
-        if min(b.size for b in bins) < 2 * FEWEST_SAMPLES:
+        is_exact = _averaging_error(values, counts, std) <= MAX_AVERAGING_ERROR * std
+        fewest = min(b.size for b in bins)
+        if is_exact or max(counts) >= MOST_BINS or fewest < 2 * FEWEST_SAMPLES:
             break
         count += 1
     middle = np.array([b[index] for b, (_, index, _) in zip(bins, fits, strict=True)])
