@@ -236,34 +236,33 @@ def read_lines(journal: Journal) -> Past:
     following = NextConditions()
     closed: list[JournalLine] = []
     lines: list[tuple[str, JournalLine]] = []
-    has_header = False
-    for where, data in journal.entries():
-        if not has_header and (data is None or data.get("format") != FORMAT):
-            raise OrthocalError(
-                "is not the journal of a recording; move it away, and the readings count as they "
-                "are",
-                where=str(journal.path),
-            )
+    entries = journal.entries()
+    first = next(entries, None)
+    if first is None:
+        journal.append({"format": FORMAT})
+    elif (first[1] or {}).get("format") != FORMAT:
+        raise OrthocalError(
+            "is not the journal of a recording; move it away, and the readings count as they are",
+            where=str(journal.path),
+        )
+    for where, data in entries:
         if data == CLOSED:
             closed += [line for _, line in lines]
             lines.clear()
-        elif has_header:
-            try:
-                if data and "done" not in data:
-                    noted = validate(NextConditions, data, where=where, error=OrthocalError)
-                    following = NextConditions(**following.stated | noted.stated)
-                    continue
+            continue
+        try:
+            if data and "done" not in data:
+                noted = validate(NextConditions, data, where=where, error=OrthocalError)
+                following = NextConditions(**following.stated | noted.stated)
+            else:
                 line = validate(JournalLine, data, where=where, error=OrthocalError)
-            except OrthocalError:
-                raise OrthocalError(
-                    "is not a line of a recording: the journal is damaged; move it away, and the "
-                    "readings count as they are",
-                    where=where,
-                ) from None
-            lines.append((where, line))
-        has_header = True
-    if not has_header:
-        journal.append({"format": FORMAT})
+                lines.append((where, line))
+        except OrthocalError:
+            raise OrthocalError(
+                "is not a line of a recording: the journal is damaged; move it away, and the "
+                "readings count as they are",
+                where=where,
+            ) from None
     return Past(closed, lines, following)
 
 

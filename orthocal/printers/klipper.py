@@ -230,13 +230,10 @@ def _log_from_steps(
         pairs = [*manual, *pairs]
     require_points(len(pairs), EXPECTED)
     settings.require_plausible()
-    stable = np.array([s for _, s in pairs])
-    if stable.shape != (len(pairs), 3) or not np.isfinite(stable).all():
-        raise SessionError("expected three step counts per height")
     if not settings.probe[2]:  # not stated: the height of the triggers replaces it
         settings = replace(settings, probe=(*settings.probe[:2], -pairs[-1][0] * MM))
     heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
-    carriages = np.array(settings.homed) - stable * steps
+    carriages = np.array(settings.homed) - np.array([s for _, s in pairs]) * steps
     return PrinterLog(
         settings,
         carriages,

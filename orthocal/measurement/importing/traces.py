@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 
 from orthocal.arrays import Array, Indices
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError, SessionError, errors_at
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.coordinate_tables import stream_columns
 from orthocal.measurement.files.readings_file import COORDINATES
@@ -238,10 +238,8 @@ def bin_traces(session: Session, traces: Mapping[str, Trace]) -> dict[str, Binne
     binned = {}
     for name, trace in traces.items():
         require_name(name, session.setups, "setup", where="--trace")
-        try:
+        with errors_at(f"trace of {name}"):
             binned[name] = bin_trace(trace)
-        except SessionError as e:
-            raise SessionError(e.problem, where=f"trace of {name}") from None
     return binned
 
 
