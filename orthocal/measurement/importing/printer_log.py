@@ -86,9 +86,14 @@ class PrinterImport:
 def recognise_log(path: Path) -> FirmwareName | None:
     """Firmware that wrote a log; None if the file is not clearly such a log."""
     try:
-        return find_firmware(RECEIVED.sub("", read_text(path, error=SessionError)))
+        return find_firmware(_read(path))
     except SessionError:
         return None
+
+
+def _read(path: Path) -> str:
+    """Text of a log as the printer sent it."""
+    return RECEIVED.sub("", read_text(path, error=SessionError))
 
 
 def import_printer_log(
@@ -109,13 +114,7 @@ def import_printer_log(
     Raises:
         SessionError: If a file is wrong or incomplete; names file and line or key.
     """
-    source = LogText(
-        tuple(
-            (str(p), RECEIVED.sub("", read_text(Path(p), error=SessionError)))
-            for p in (*settings, log)
-        ),
-        radius,
-    )
+    source = LogText(tuple((str(p), _read(Path(p))) for p in (*settings, log)), radius)
     name = None if firmware is None else require_firmware(firmware, option="--format")
     name = name or find_firmware(source.text[source.begin :]) or find_firmware(source.text)
     if name is None:
