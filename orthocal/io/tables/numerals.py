@@ -81,11 +81,10 @@ def is_missing(text: str) -> bool:
 
 def parse_numeral(text: str, sign: Sign) -> Decimal | None:
     """Exact value of a numeral with a decimal sign; None if it is not a number."""
-    text = plain_minus(tidy_text(text))
+    # an apostrophe marks a number as text in spreadsheet programs
+    text = plain_minus(tidy_text(text)).removeprefix("'")
     if len(text) > LONGEST_NUMBER:
         return None
-    if text.startswith("'"):  # marks a number as text in spreadsheet programs
-        text = text[1:]
     match = _PATTERNS[sign].fullmatch(text)
     if not match:
         return None

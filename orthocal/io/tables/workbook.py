@@ -153,8 +153,7 @@ class _Workbook:
         self._archive = archive
         self._where = where
         self._unpacked = 0
-        targets = {kind: target for kind, target in self._relations("").values()}
-        main = targets.get("officeDocument", "xl/workbook.xml")
+        main = dict(self._relations("").values()).get("officeDocument", "xl/workbook.xml")
         root, relations = self._tree(main), self._relations(main)
         self._sheets = [
             (e.get("name", ""), e.get("state", "visible") == "visible", target)
@@ -164,15 +163,14 @@ class _Workbook:
             for kind, target in [relations.get(value, ("", ""))]
             if kind == "worksheet"
         ]
-        by_kind = {kind: target for kind, target in relations.values()}
+        by_kind = dict(relations.values())
         self._formats: list[NumberFormat] = []
         if "styles" in by_kind:
             self._formats = _read_formats(self._tree(by_kind["styles"]))
-        self._strings = (
-            [_join_text(item) for item in self._elements(by_kind["sharedStrings"], "si")]
-            if "sharedStrings" in by_kind
-            else []
-        )
+        self._strings: list[str] = []
+        if "sharedStrings" in by_kind:
+            items = self._elements(by_kind["sharedStrings"], "si")
+            self._strings = [_join_text(item) for item in items]
         old_epoch = any(e.get("date1904") in ("1", "true") for e in root.iter("{*}workbookPr"))
         self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
 

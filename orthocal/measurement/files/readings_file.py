@@ -200,9 +200,10 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             for line, row in islice(rows(), MOST_READINGS + 1):
                 names = ("reading_mm", *COORDINATES)
                 numerals += [Numeral(row[name], line) for name in names if row.get(name)]
-        sign = decide_decimal_sign(
-            numerals, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
-        ).sign
+        if any("," in numeral.text for numeral in numerals):
+            sign = decide_decimal_sign(
+                numerals, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
+            ).sign
     for line, cells in rows():
         cells |= {n: _standard_number(text, sign) for n, text in cells.items() if n in NUMBERS}
         yield RawReading(f"{path}:{line}", line, **cells)
