@@ -296,14 +296,13 @@ def last_words(text: str, pattern: str) -> dict[str, str]:
 
 
 def command_words(text: str, pattern: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Position of each line with a G-code command, and its letters and values."""
+    """Position of each line with a G-code command, and its letters and values.
+
+    Blanks need not separate the words.
+    """
+    words = re.compile(rf"(?<![A-Za-z])([A-Z]) ?({NUMBER}(?::{NUMBER})*)")
     for match in re.finditer(rf"^[^;\n]*?\b{pattern}(?![\d.])([^;\n]*)", text, re.MULTILINE):
-        yield match.start(1), read_words(match[1])
-
-
-def read_words(text: str) -> dict[str, str]:
-    """Letters and values of a G-code line, also if no blanks separate them."""
-    return dict(re.findall(rf"(?<![A-Za-z])([A-Z]) ?({NUMBER}(?::{NUMBER})*)", text))
+        yield match.start(1), dict(words.findall(match[1]))
 
 
 def write_words(letters: str, values: Array) -> str:

@@ -19,10 +19,10 @@ from orthocal.printers.log import (
     NUMBER,
     LogText,
     PrinterLog,
+    command_words,
     last_words,
     numbers,
     probed_log,
-    read_words,
     settings_of_m665,
     unstated_trigger,
     write_words,
@@ -38,7 +38,6 @@ EXPECTED = (
 _HEIGHTS = re.compile(r"[Bb]ed probe heights:(?P<values>[^,\n]*), mean")
 _CALIBRATED = re.compile(r"Calibrated (\d+) factors using \d+ points")
 _STOPPED = re.compile(rf"Stopped at height {NUMBER} mm")
-_POINT = re.compile(r"^[^;\n]*?\bG30\b(?P<words>[^;\n]*)", re.MULTILINE)
 _M665 = re.compile(
     rf"Diagonals? (?P<L>{NUMBER}(?::{NUMBER})*), delta radius (?P<R>{NUMBER}), homed height "
     rf"(?P<H>{NUMBER}), bed radius {NUMBER}, X (?P<X>{NUMBER})[^,]*, Y (?P<Y>{NUMBER})[^,]*, "
@@ -158,11 +157,10 @@ def _points(source: LogText, report: int) -> Array:
     The commands before the report count, all commands if there are none. P0 begins a new list.
     """
     places: dict[float, tuple[float, float]] = {}
-    matches = list(_POINT.finditer(source.text))
-    for match in [m for m in matches if m.start() < report] or matches:
-        words = read_words(match["words"])
+    commands = list(command_words(source.text, "G30"))
+    for position, words in [c for c in commands if c[0] < report] or commands:
         if {"P", "X", "Y"} <= words.keys():
-            line = source.place(match.start())
+            line = source.place(position)
             number, x, y = numbers([words[k] for k in "PXY"], where=line, name="G30")
             if number == 0.0:
                 places = {}
