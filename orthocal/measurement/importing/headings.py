@@ -374,22 +374,26 @@ def choose_columns(
             )
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
     headings = _read_headings(texts, assigned, points)
-    roles = {h.role for h in headings if h is not None}
-    optional = {"setup": one_setup, "posture": roles.issuperset(NOMINAL)}
-    single: dict[Role, int] = {}
+    columns: dict[Role, list[int]] = {role: [] for role in ROLES}
+    for index, heading in enumerate(headings):
+        if heading is not None:
+            columns[heading.role].append(index)
+    has_points = any(columns[role] for role in POINT)
+    required: dict[Role, bool] = {
+        "setup": not one_setup,
+        "posture": not all(columns[role] for role in NOMINAL),
+        **dict.fromkeys(POINT, has_points),
+    }
+    lengths = ("reading", *POINT) if columns["posture"] else LENGTHS
+    readings = {i: h for i, h in enumerate(headings) if h is not None and h.role in lengths}
     with errors_at(where):
-        for role in SINGLE:
-            indices = [i for i, h in enumerate(headings) if h is not None and h.role == role]
-            if len(indices) > 1:
-                raise _several_columns(texts, indices, role)
-            if indices:
-                single[role] = indices[0]
-            elif not optional.get(role, True):
+        for role in (*SINGLE, *lengths[1:]):
+            if len(columns[role]) > 1:
+                raise _several_columns(texts, columns[role], role)
+            if not columns[role] and required.get(role):
                 raise _missing_column(role)
-        lengths = LENGTHS if "posture" not in single else ("reading", *POINT)
-        readings = {i: h for i, h in enumerate(headings) if h is not None and h.role in lengths}
-        reading_columns = {i: h for i, h in readings.items() if h.role == "reading"}
-        has_points = _check_points(texts, readings)
+        single = {role: columns[role][0] for role in SINGLE if columns[role]}
+        reading_columns = {i: readings[i] for i in columns["reading"]}
         if reading_columns or not has_points:
             _check_readings(texts, reading_columns, single.get("cycle"))
     used = {*readings, *single.values()}
@@ -398,18 +402,6 @@ def choose_columns(
         readings=readings,
         extra=tuple(i for i, text in enumerate(texts) if i not in used and text.strip()),
     )
-
-
-def _check_points(texts: Sequence[str], columns: Mapping[int, Heading]) -> bool:
-    """Refuse missing and ambiguous columns of points; True if a table has points."""
-    by_role = {role: [i for i, h in columns.items() if h.role == role] for role in LENGTHS[1:]}
-    has_points = any(by_role[role] for role in POINT)
-    for role, indices in by_role.items():
-        if len(indices) > 1:
-            raise _several_columns(texts, indices, role)
-        if not indices and has_points and role in POINT:
-            raise _missing_column(role)
-    return has_points
 
 
 def _check_readings(
