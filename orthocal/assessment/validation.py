@@ -61,7 +61,6 @@ from orthocal.measurement.joining import (
     gather_sessions,
     join_sessions,
     list_members,
-    on_one_printer,
     require_same_tolerances,
 )
 from orthocal.runtime.threads import one_thread
@@ -311,7 +310,7 @@ def _apply_stated(
     robot, settings = calibration.robot.with_tolerances(tolerances), calibration.session.firmware
     placed = sessions
     if settings is not None:
-        placed = on_one_printer(sessions, calibration.robot, settings.homed)
+        placed = [s.on_printer(calibration.robot, settings.homed) for s in sessions]
     for session in placed:
         require_calibrated_robot(calibration, session)
     restated = [

@@ -492,6 +492,8 @@ class Session:
     def on_printer(self, robot: Robot, homed: ArrayLike) -> Session:
         """Session of a printer in the coordinates of its robot before settings changed.
 
+        A session without settings is returned unchanged.
+
         Settings change the nominal dimensions and the coordinates of the homed carriages, but not
         the travel of the carriages below their endstops. Stated tolerances and effects of the
         session stay.
@@ -499,14 +501,9 @@ class Session:
         Args:
             robot: Robot with other nominal dimensions.
             homed: Coordinates of its homed carriages, shape (3,), [m].
-
-        Raises:
-            SessionError: If the session states no settings of a firmware.
         """
         if self.firmware is None:
-            raise SessionError(
-                "states no settings of a firmware", where=str(self.path or "session")
-            )
+            return self
         change = np.asarray(homed, dtype=np.float64) - self.firmware.homed
         drives = {name: read_only(p.drives + change) for name, p in self.postures.items()}
         plain = replace(robot, parameters=robot.parameters.defaults)

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from typing import Literal
 
 import numpy as np
@@ -90,10 +90,7 @@ def parse_numeral(text: str, sign: Sign) -> Decimal | None:
         return None
     integer = re.sub("[^0-9]", "", match["integer"] or "")
     fraction = match["fraction"] or match["only"] or ""
-    try:
-        return Decimal(f"{match['sign']}{integer or '0'}.{fraction or '0'}e{match['power'] or '0'}")
-    except InvalidOperation:
-        return None
+    return Decimal(f"{match['sign']}{integer or '0'}.{fraction or '0'}e{match['power'] or '0'}")
 
 
 def format_decimal(value: Decimal) -> str:
