@@ -25,16 +25,12 @@ from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError, errors_at
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of, value_name
+from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import MOST_READINGS
-from orthocal.measurement.files.write_session import (
-    add_alignment,
-    add_readings,
-    readings_table,
-)
+from orthocal.measurement.files.write_session import add_alignment, add_readings, readings_table
 from orthocal.measurement.motion.motion import state_possible_path_approaches
 from orthocal.measurement.recorded_rows import (
     CLOSED,
@@ -206,14 +202,8 @@ class Recording:
             reading = to_mm(float(value if along is None else np.dot(along, value)))
             of_setup_mm = [r.value / MM for r in self.rows if r.setup == row.setup and r.is_read]
             with errors_at(row.label_with_cycle):
-                check_range(
-                    reading,
-                    self.session.gauges[setup.gauge],
-                    difference=self.session.is_difference(row),
-                    name=value_name(row.setup),
-                    largest=largest_reading(setup.sensor),
-                    of_setup_mm=of_setup_mm,
-                )
+                gauge = self.session.gauges[setup.gauge]
+                check_range(reading, setup, gauge, minus=row.minus, of_setup_mm=of_setup_mm)
                 two_postures = row.minus is not None
                 check_conditions(conditions, self.session.robot, two_postures=two_postures)
             readings_mm.append(round(reading, DECIMALS))

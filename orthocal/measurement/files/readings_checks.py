@@ -24,7 +24,7 @@ from orthocal.sensors.protocol import is_difference, largest_reading, reads_pair
 from orthocal.session.completeness import require_name
 from orthocal.session.differences import IndependentReadings
 from orthocal.session.points import count_readings
-from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
+from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session, Setup
 from orthocal.text import shorten, spans
 from orthocal.units import MM
 
@@ -100,10 +100,9 @@ def _find_out_of_range(accepted: _AcceptedReadings, points: PointRows) -> dict[s
         try:
             check_range(
                 reading.value / MM,
+                setup,
                 points.gauges[setup.gauge],
-                difference=is_difference(reading.minus, setup.sensor),
-                name=value_name(reading.setup),
-                largest=largest_reading(setup.sensor),
+                minus=reading.minus,
                 of_setup_mm=of_setup_mm.get(reading.setup, ()),
             )
         except SessionError as e:
@@ -363,29 +362,22 @@ def parse_cycle(text: str) -> int:
 
 
 def check_range(
-    value_mm: float,
-    gauge: Gauge,
-    *,
-    difference: bool,
-    name: str,
-    largest: float,
-    of_setup_mm: ArrayLike,
+    value_mm: float, setup: Setup, gauge: Gauge, *, minus: str | None, of_setup_mm: ArrayLike
 ) -> None:
     """Refuse a reading beyond the range of the gauge or of its kind of sensor. NaN passes.
 
     Args:
         value_mm: Reading, [mm].
-        gauge: The gauge.
-        difference: Whether the reading is a difference of two postures.
-        name: Name of the value, for messages.
-        largest: Largest reading of the kind of sensor, [m].
+        setup: Its setup.
+        gauge: The gauge of the setup.
+        minus: Posture whose reading is subtracted; None for a single reading.
         of_setup_mm: Readings of the setup, [mm]. If most are in range, a larger reading may have a
             misplaced decimal point.
 
     Raises:
         SessionError: If the reading is out of range.
     """
-    largest_mm = largest / MM
+    difference, largest_mm = is_difference(minus, setup.sensor), largest_reading(setup.sensor) / MM
     range_mm = (-largest_mm, largest_mm) if gauge.range is None else [v / MM for v in gauge.range]
     lowest, highest = range_mm
     if difference and gauge.range is not None:
@@ -402,10 +394,8 @@ def check_range(
     if ratio > POINT_HINT_RATIO and 2 * n_in_range > of_setup.size:
         hint = "; its decimal point may be misplaced"
     if beyond_sensor:
-        expected = (
-            f"expected a number within ±{largest_mm:g}, the limit of this kind of sensor{hint}"
-        )
+        expected = f"expected a number within ±{largest_mm:g}, the limit of this kind of sensor"
     else:
         kind = "a difference" if difference else "a reading"
-        expected = f"the gauge's range allows {kind} from {limits}{hint}"
-    raise SessionError(f"{name} is {value_mm:g}; {expected}")
+        expected = f"the gauge's range allows {kind} from {limits}"
+    raise SessionError(f"{value_name(setup.name)} is {value_mm:g}; {expected}{hint}")

@@ -48,13 +48,7 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import require_tcp
-from orthocal.sensors.protocol import (
-    ToolPath,
-    has_dial,
-    probing_direction,
-    reads_pairs,
-    tool_path,
-)
+from orthocal.sensors.protocol import ToolPath, has_dial, probing_direction, reads_pairs, tool_path
 from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM
