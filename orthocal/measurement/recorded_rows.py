@@ -219,20 +219,15 @@ class NextConditions(Keys):
         return self.model_dump(exclude_none=True, by_alias=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Past:
-    """Content of a journal."""
+def read_lines(
+    journal: Journal,
+) -> tuple[list[JournalLine], list[tuple[str, JournalLine]], NextConditions]:
+    """Content of a journal; a new one gets its header.
 
-    closed: list[JournalLine]
-    """Changes of the recordings that ended regularly."""
-    lines: list[tuple[str, JournalLine]]
-    """Later changes with their places."""
-    following: NextConditions
-    """Conditions that were typed last."""
-
-
-def read_lines(journal: Journal) -> Past:
-    """Content of a journal; a new one gets its header."""
+    Returns:
+        Changes of the recordings that ended regularly, later changes with their places, and the
+        conditions that were typed last.
+    """
     following = NextConditions()
     closed: list[JournalLine] = []
     lines: list[tuple[str, JournalLine]] = []
@@ -263,7 +258,7 @@ def read_lines(journal: Journal) -> Past:
                 "readings count as they are",
                 where=where,
             ) from None
-    return Past(closed, lines, following)
+    return closed, lines, following
 
 
 def find_pending(

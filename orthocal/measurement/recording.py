@@ -194,10 +194,10 @@ class Recording:
         if np.isnan(value).any():
             where = rows[0].label_with_cycle
             raise SessionError("reading_mm is nan; expected a number", where=where)
-        setups = [self.session.setups[row.setup] for row in rows]
         conditions = conditions or Conditions()
         readings_mm = []
-        for row, setup in zip(rows, setups, strict=True):
+        for row in rows:
+            setup = self.session.setups[row.setup]
             along = getattr(setup.sensor, "along", None)
             reading = to_mm(float(value if along is None else np.dot(along, value)))
             of_setup_mm = [r.value / MM for r in self.rows if r.setup == row.setup and r.is_read]
@@ -389,8 +389,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
-        past = read_lines(journal)
-        closed, lines = past.closed, past.lines
+        closed, lines, following = read_lines(journal)
         if _is_outdated(session):  # another process may have written before the lock
             session = load_plan(path, wrong=wrong)
         for file, content in _files_to_add(session).items():
@@ -416,7 +415,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             journal,
             _digest(table),
             find_dropped(session, [*closed, *(change for _, change in lines)]),
-            past.following,
+            following,
             len(pending),
             edited,
             wrong,

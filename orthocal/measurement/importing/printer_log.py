@@ -159,7 +159,7 @@ def _session(log: PrinterLog, path: Path) -> Session:
     surface = Artefact("plate", direction_std=TILT_STD, form_degree=4)
     setup = Setup("bed", Probe("-z", surface, (x, y, z), trigger_std=0.0), "", zero="known")
     readings = tuple(
-        Reading("bed", name, None, 1, float(height), None, None)
+        Reading("bed", name, value=float(height))
         for name, height in zip(postures, log.heights, strict=True)
     )
     largest = float(np.abs(log.heights).max())
