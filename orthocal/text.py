@@ -43,7 +43,8 @@ def printable(text: str, *, keep: str = "") -> str:
     """
     if _ORDINARY.fullmatch(text):
         return text
-    return "".join(c if c in keep or not _is_escaped(c) else _escape(c) for c in text)
+    escaped = {c for c in set(text) - set(keep) if unicodedata.category(c) in _ESCAPED}
+    return "".join(_escape(c) if c in escaped else c for c in text)
 
 
 def quote_path(path: str | Path) -> str:
@@ -118,16 +119,8 @@ def comment_safe(text: str, longest: int = 60) -> str:
     return _UNSAFE.sub("_", text)[:longest]
 
 
-def _is_escaped(character: str) -> bool:
-    return unicodedata.category(character) in _ESCAPED
-
-
 def _escape(character: str) -> str:
     code = ord(character)
-    if character in "\n\r\t":
-        return {"\n": "\\n", "\r": "\\r", "\t": "\\t"}[character]
     if 0xDC80 <= code <= 0xDCFF:  # a byte that os.fsdecode could not decode
         return f"\\x{code - 0xDC00:02x}"
-    if code <= 0xFF:
-        return f"\\x{code:02x}"
-    return f"\\u{code:04x}" if code <= 0xFFFF else f"\\U{code:08x}"
+    return character.encode("unicode_escape").decode()

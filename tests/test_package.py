@@ -42,7 +42,7 @@ def test_the_wheel_holds_robots_and_types(wheel):
     assert "orthocal/_robots/orthoglide/orthoglide.yaml" in names
     assert "orthocal/export/linuxcnc/templates/orthocal_core.c" in names
     assert "orthocal/export/linuxcnc/templates/orthocal_core.h" in names
-    assert "orthocal/py.typed" in names
+    assert {"orthocal/py.typed", "orthocal/__init__.pyi"} <= set(names)
     for name in ("web/scene.html", "web/scene.css", "web/scene.js"):
         assert f"orthocal/viewer/{name}" in names
     assert "orthocal/output/report/report.css" in names

@@ -35,7 +35,6 @@ from orthocal.assessment.wording import describe_actions, join_texts
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import place_of
 from orthocal.assessment.words.remedies import command_to_restart
-from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
     EXIT_CODES,
     Assessment,
@@ -45,7 +44,7 @@ from orthocal.calibration.assessment_record import (
     Finding,
     FindingKind,
 )
-from orthocal.calibration.build_record import assemble_calibration
+from orthocal.calibration.build_record import adjust_calibration, assemble_calibration
 from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.calibration.recorded_robot import require_calibrated_robot
 from orthocal.calibration.refit import calibrated_theta, repeat_fit, restore_session
@@ -237,7 +236,8 @@ def validate_calibration(
     require_calibration(calibration)
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
-    fit, refit = _refit(calibration, join_sessions(measured))
+    fit = repeat_fit(calibration, join_sessions(measured))
+    refit = assemble_calibration(fit, nominal=calibrated_theta(calibration, fit))
     before = restore_session(calibration)
     all_sessions = join_sessions([before, *measured])
     judgement = judge_session(all_sessions)
@@ -324,15 +324,6 @@ def _apply_stated(
     calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
     _require_new(calibration, restated)
     return calibration, restated
-
-
-def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration]:
-    """Fit and calibration of new readings.
-
-    The nominal readings of the calibration are the predicted ones.
-    """
-    fit = repeat_fit(calibration, session)
-    return fit, assemble_calibration(fit, nominal=calibrated_theta(calibration, fit))
 
 
 def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:

@@ -70,13 +70,11 @@ def describe_machine(
     Raises:
         RobotError: If the dimensions are impossible, or the YAML lacks the line of one of them.
     """
-    impossible = dimensions.find_problem()
-    if impossible:
+    if impossible := dimensions.find_problem():
         raise RobotError(impossible[1], where="dimensions")
     drives = dimensions.drives_of()
     joints = (AS_DRIVE,) * len(drives) if counting is None else tuple(counting)
-    problem = find_counting_problem(joints, len(drives))
-    if problem:
+    if problem := find_counting_problem(joints, len(drives)):
         raise RobotError(problem, where="dimensions")
     base = dimensions.yaml() if description is None else description
     if tolerances:
@@ -220,15 +218,10 @@ def _override_tolerances(text: str, tolerances: Mapping[str, float], file: str) 
     Raises:
         RobotError: If the YAML has no line of tolerances.
     """
-    stated = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
+    stated = ", ".join(f"{json.dumps(name)}: {v:.12g}" for name, v in tolerances.items())
     text, count = _TOLERANCES_LINE.subn(lambda m: f"{m[1]}, overrides: {{{stated}}}}}", text)
     if count != 1:
         raise RobotError(
             "has no line 'tolerances: {...}'; expected one for other tolerances", where=file
         )
     return text
-
-
-def _number(value: float) -> str:
-    """Number with 12 significant digits."""
-    return f"{round(value, 12) + 0.0:.12g}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -118,11 +118,6 @@ class Dimensions(ABC):
         """Names of the drives."""
         return tuple(f"{k}_slide" for k in cls.letters)
 
-    @classmethod
-    def axes_words(cls) -> str:
-        """Coordinates of the tool as text, such as x, y and z."""
-        return f"{', '.join(cls.coordinates[:-1])} and {cls.coordinates[-1]}"
-
     @property
     @abstractmethod
     def zero(self) -> float:
@@ -161,13 +156,6 @@ class Dimensions(ABC):
     def adjustments(self) -> str:
         """Mechanical adjustments as YAML lines below `orthocal`; "" by default."""
         return ""
-
-    @classmethod
-    def of_keys(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Fields of the dimensions, [m, rad], from keys of machine.yaml."""
-        return {
-            d.name: d.to_si(values[d.key] if d.separator else [values[d.key]]) for d in cls.keys
-        }
 
 
 def find_length_problem(name: str, part: str, value: float) -> tuple[str, str] | None:

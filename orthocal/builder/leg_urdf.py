@@ -10,7 +10,7 @@ b to rod a. Y = Z × X is the axis of the rods' hinges.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,6 +30,10 @@ COLOURS = {
 }
 
 LEG_COLOURS = ("red", "green", "blue")
+"""Colours of the legs, in their order."""
+
+_, Y, Z = np.eye(3)
+"""Axes of the hinges in the frame of a leg."""
 
 QUARTER_TURN = 0.5 * np.pi
 
@@ -110,11 +114,6 @@ class Body:
     """Hinge on the platform, in the leg's frame."""
 
 
-def coloured(letters: str) -> Iterable[tuple[str, str]]:
-    """Pairs of a leg's name and colour."""
-    return zip(letters, LEG_COLOURS, strict=False)
-
-
 def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: str) -> str:
     """URDF of a machine whose tool centre point is at the origin in the mechanical zero.
 
@@ -129,9 +128,7 @@ def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment:
     for leg in legs:
         _add_leg(root, leg, body)
         if leg is not first:
-            k = leg.name
-            _link(root, f"{k}_foot_end")
-            _fixed(root, f"{k}_foot_end_mount", f"{k}_foot", f"{k}_foot_end", _to_tool(leg))
+            _fixed(root, f"{leg.name}_foot_end", f"{leg.name}_foot", _to_tool(leg))
     _add_platform(root, f"{first.name}_foot", first, body)
     return _text(root, comment)
 
@@ -154,29 +151,23 @@ def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: 
     if body.rods_apart:
         for leg in legs:
             _add_slide(root, leg, body)
-            k = leg.name
-            _link(root, f"{k}_yoke", _yoke(body))
-            _fixed(root, f"{k}_yoke_mount", f"{k}_slider", f"{k}_yoke", _root(leg))
+            _fixed(root, f"{leg.name}_yoke", f"{leg.name}_slider", _root(leg), _yoke(body))
             _add_parallelogram(root, leg, body)
         _add_platform(root, f"{first.name}_leg_tip", first, body)
         for leg in others:
-            _mounted(root, f"{leg.name}_pin", "platform", leg.tip)
+            _fixed(root, f"{leg.name}_pin", "platform", _at(leg.tip))
         return _text(root, comment)
     for leg in legs:
         k = leg.name
         _add_slide(root, leg, body)
-        _link(root, f"{k}_leg_root")
-        _fixed(root, f"{k}_leg_root_mount", f"{k}_slider", f"{k}_leg_root", _root(leg))
-        _link(root, f"{k}_rod", _rod(leg, body))
-        _hinge(root, f"{k}_bar", f"{k}_slider", f"{k}_rod", _root(leg), np.eye(3)[1])
-        _link(root, f"{k}_foot")
-        end = np.array([leg.length, 0.0, 0.0]), np.eye(3)
+        _fixed(root, f"{k}_leg_root", f"{k}_slider", _root(leg))
+        _hinge(root, f"{k}_bar", f"{k}_slider", f"{k}_rod", _root(leg), Y, _rod(leg, body))
+        end = _at(np.array([leg.length, 0.0, 0.0]))
         if leg is first:
-            _hinge(root, f"{k}_end", f"{k}_rod", f"{k}_foot", end, np.eye(3)[1])
+            _hinge(root, f"{k}_end", f"{k}_rod", f"{k}_foot", end, Y)
             continue
-        _fixed(root, f"{k}_foot_mount", f"{k}_rod", f"{k}_foot", end)
-        _link(root, f"{k}_end")
-        _fixed(root, f"{k}_end_mount", f"{k}_foot", f"{k}_end", _to_tool(leg))
+        _fixed(root, f"{k}_foot", f"{k}_rod", end)
+        _fixed(root, f"{k}_end", f"{k}_foot", _to_tool(leg))
     _add_platform(root, f"{first.name}_foot", first, body)
     return _text(root, comment)
 
@@ -200,58 +191,43 @@ def _text(root: etree._Element, comment: str) -> str:
 
 def _add_platform(root: etree._Element, parent: str, leg: LegGeometry, body: Body) -> None:
     """Add platform and tool centre point to the link at the end of a leg."""
-    _link(root, "platform", body.platform)
-    _fixed(root, "platform_mount", parent, "platform", _to_tool(leg))
-    _link(root, "tcp")
-    _fixed(root, "tcp_mount", "platform", "tcp", (np.zeros(3), np.eye(3)))
+    _fixed(root, "platform", parent, _to_tool(leg), body.platform)
+    _fixed(root, "tcp", "platform", _at(np.zeros(3)))
 
 
 def _add_leg(root: etree._Element, leg: LegGeometry, body: Body) -> None:
     """Add slide and leg of a spatial machine."""
     k = leg.name
-    y, z = np.eye(3)[1], np.eye(3)[2]
     _add_slide(root, leg, body)
-    _link(root, f"{k}_yoke", _yoke(body))
-    _hinge(root, f"{k}_swivel", f"{k}_slider", f"{k}_yoke", _root(leg), z)
+    _hinge(root, f"{k}_swivel", f"{k}_slider", f"{k}_yoke", _root(leg), Z, _yoke(body))
     _add_parallelogram(root, leg, body)
-    _link(root, f"{k}_knuckle", [Shape((0.012, 0.024), "dark")])
-    down = np.array([0.0, 0.0, -0.5 * body.rods_apart])
-    _hinge(root, f"{k}_wrist", f"{k}_crossbar", f"{k}_knuckle", (down, np.eye(3)), z)
-    _link(root, f"{k}_foot", [body.foot])
-    _hinge(root, f"{k}_fork", f"{k}_knuckle", f"{k}_foot", (np.zeros(3), np.eye(3)), y)
+    knuckle, down = [Shape((0.012, 0.024), "dark")], -0.5 * body.rods_apart * Z
+    _hinge(root, f"{k}_wrist", f"{k}_crossbar", f"{k}_knuckle", _at(down), Z, knuckle)
+    _hinge(root, f"{k}_fork", f"{k}_knuckle", f"{k}_foot", _at(np.zeros(3)), Y, [body.foot])
 
 
 def _add_slide(root: etree._Element, leg: LegGeometry, body: Body) -> None:
     """Add the slide of a leg."""
     k, (to_root, _) = leg.name, _root(leg)
     slider = [Shape(s.sizes, s.material, to_root + s.position, s.rotation) for s in body.slider]
-    _link(root, f"{k}_slider", slider)
-    _joint(
-        root,
-        f"{k}_slide",
-        "prismatic",
-        ("base", f"{k}_slider"),
-        (leg.slide - leg.zero * leg.direction, leg.frame),
-        leg.frame.T @ leg.direction,
-        leg.travel,
-    )
+    place = (leg.slide - leg.zero * leg.direction, leg.frame)
+    joint = _attach(root, f"{k}_slide", "prismatic", ("base", f"{k}_slider"), place, slider)
+    _limit(joint, leg.frame.T @ leg.direction, leg.travel)
 
 
 def _add_parallelogram(root: etree._Element, leg: LegGeometry, body: Body) -> None:
     """Add two rods between yoke and crossbar."""
     k, half = leg.name, 0.5 * body.rods_apart
-    y, tip = np.eye(3)[1], np.array([leg.length, 0.0, 0.0])
-    up, down = np.array([0.0, 0.0, half]), np.array([0.0, 0.0, -half])
-    for name, side in (("a", up), ("b", down)):
-        _link(root, f"{k}_rod_{name}", _rod(leg, body))
-        _hinge(root, f"{k}_bar_{name}", f"{k}_yoke", f"{k}_rod_{name}", (side, np.eye(3)), y)
-    _mounted(root, f"{k}_rod_b_tip", f"{k}_rod_b", tip)
+    tip, down = _at(np.array([leg.length, 0.0, 0.0])), -half * Z
+    for rod, side in (("a", half * Z), ("b", down)):
+        name, shapes = f"{k}_rod_{rod}", _rod(leg, body)
+        _hinge(root, f"{k}_bar_{rod}", f"{k}_yoke", name, _at(side), Y, shapes)
+    _fixed(root, f"{k}_rod_b_tip", f"{k}_rod_b", tip)
     crossbar = [Shape((0.009, body.rods_apart + 0.02), "steel", down)]
-    _link(root, f"{k}_crossbar", crossbar)
-    _hinge(root, f"{k}_coupler", f"{k}_rod_a", f"{k}_crossbar", (tip, np.eye(3)), y)
-    _mounted(root, f"{k}_crossbar_end", f"{k}_crossbar", 2.0 * down)
-    _mounted(root, f"{k}_leg_root", f"{k}_yoke", np.zeros(3))
-    _mounted(root, f"{k}_leg_tip", f"{k}_crossbar", down)
+    _hinge(root, f"{k}_coupler", f"{k}_rod_a", f"{k}_crossbar", tip, Y, crossbar)
+    _fixed(root, f"{k}_crossbar_end", f"{k}_crossbar", _at(2.0 * down))
+    _fixed(root, f"{k}_leg_root", f"{k}_yoke", _at(np.zeros(3)))
+    _fixed(root, f"{k}_leg_tip", f"{k}_crossbar", _at(down))
 
 
 def _yoke(body: Body) -> list[Shape]:
@@ -272,6 +248,11 @@ def _rod(leg: LegGeometry, body: Body) -> list[Shape]:
     ]
 
 
+def _at(position: Array) -> tuple[Array, Array]:
+    """Placement at a position, parallel to the parent link."""
+    return position, np.eye(3)
+
+
 def _root(leg: LegGeometry) -> tuple[Array, Array]:
     """Middle of the hinge on the slide, and axes of the leg, in the slide's frame."""
     return leg.frame.T @ (leg.root - leg.slide), leg.frame.T @ leg.axes
@@ -282,7 +263,7 @@ def _to_tool(leg: LegGeometry) -> tuple[Array, Array]:
     return -leg.axes.T @ leg.tip, leg.axes.T
 
 
-def _link(root: etree._Element, name: str, shapes: Sequence[Shape] = ()) -> None:
+def _link(root: etree._Element, name: str, shapes: Sequence[Shape]) -> None:
     """Add a link with its shapes."""
     link = etree.SubElement(root, "link", name=name)
     for shape in shapes:
@@ -299,20 +280,32 @@ def _link(root: etree._Element, name: str, shapes: Sequence[Shape] = ()) -> None
         etree.SubElement(visual, "material", name=shape.material)
 
 
-def _mounted(root: etree._Element, name: str, parent: str, position: Array) -> None:
-    """Add a link without shapes that is fixed to another one and parallel to it."""
-    _link(root, name)
-    _fixed(root, f"{name}_mount", parent, name, (position, np.eye(3)))
+def _attach(
+    root: etree._Element,
+    name: str,
+    kind: str,
+    links: tuple[str, str],
+    placement: tuple[Array, Array],
+    shapes: Sequence[Shape],
+) -> etree._Element:
+    """Add a link with its shapes, and the joint between another link and it."""
+    _link(root, links[1], shapes)
+    joint = etree.SubElement(root, "joint", name=name, type=kind)
+    etree.SubElement(joint, "parent", link=links[0])
+    etree.SubElement(joint, "child", link=links[1])
+    _origin(joint, *placement)
+    return joint
 
 
 def _fixed(
-    root: etree._Element, name: str, parent: str, child: str, placement: tuple[Array, Array]
+    root: etree._Element,
+    name: str,
+    parent: str,
+    placement: tuple[Array, Array],
+    shapes: Sequence[Shape] = (),
 ) -> None:
-    """Add a fixed joint."""
-    joint = etree.SubElement(root, "joint", name=name, type="fixed")
-    etree.SubElement(joint, "parent", link=parent)
-    etree.SubElement(joint, "child", link=child)
-    _origin(joint, *placement)
+    """Add a link that is fixed to another one."""
+    _attach(root, f"{name}_mount", "fixed", (parent, name), placement, shapes)
 
 
 def _hinge(
@@ -322,25 +315,15 @@ def _hinge(
     child: str,
     placement: tuple[Array, Array],
     axis: Array,
+    shapes: Sequence[Shape] = (),
 ) -> None:
-    """Add a revolute joint of ±1.3 rad."""
-    _joint(root, name, "revolute", (parent, child), placement, axis, (-1.3, 1.3))
+    """Add a link on a revolute joint of ±1.3 rad."""
+    joint = _attach(root, name, "revolute", (parent, child), placement, shapes)
+    _limit(joint, axis, (-1.3, 1.3))
 
 
-def _joint(
-    root: etree._Element,
-    name: str,
-    kind: str,
-    links: tuple[str, str],
-    placement: tuple[Array, Array],
-    axis: Array,
-    limits: tuple[float, float],
-) -> None:
-    """Add a joint with limits."""
-    joint = etree.SubElement(root, "joint", name=name, type=kind)
-    etree.SubElement(joint, "parent", link=links[0])
-    etree.SubElement(joint, "child", link=links[1])
-    _origin(joint, *placement)
+def _limit(joint: etree._Element, axis: Array, limits: tuple[float, float]) -> None:
+    """Add axis and limits to a joint."""
     etree.SubElement(joint, "axis", xyz=_numbers(axis))
     low, high = map(_number, limits)
     others = {key: _number(v) for key, v in LIMITS.items()}

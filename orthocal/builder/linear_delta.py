@@ -18,7 +18,7 @@ from orthocal.builder.dimensions import (
     in_mm,
     in_unit,
 )
-from orthocal.builder.leg_urdf import Body, LegGeometry, Shape, coloured, machine_urdf
+from orthocal.builder.leg_urdf import LEG_COLOURS, Body, LegGeometry, Shape, machine_urdf
 from orthocal.builder.robot_yaml import length_sums, platform_loops, robot_yaml
 from orthocal.units import DEG
 
@@ -174,7 +174,7 @@ class LinearDelta(Dimensions):
     def legs(self) -> list[LegGeometry]:
         """Legs a, b and c."""
         legs = []
-        for (name, colour), angle in zip(coloured(self.letters), self.angles, strict=True):
+        for name, colour, angle in zip(self.letters, LEG_COLOURS, self.angles, strict=True):
             outwards = np.array([math.cos(angle), math.sin(angle), 0.0])
             frame = np.column_stack([-outwards, UP, np.cross(-outwards, UP)])
             root = (self.radius + self.platform) * outwards + self.zero * UP

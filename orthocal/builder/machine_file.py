@@ -85,18 +85,16 @@ def read_machine(path: Path) -> tuple[Dimensions, tuple[Counting, ...]]:
     if kind is None:
         raise RobotError(f"found {name!r}; expected {', '.join(KINDS)}", where=f"{path}: kind")
     keys: Any = validate(_keys_of(kind), data, where=str(path), error=RobotError)
-    box = keys.workspace_mm
+    box, stated = keys.workspace_mm, {d: getattr(keys, d.key) for d in kind.keys}
     dimensions = kind(
         workspace=None if box is None else tuple((low * MM, high * MM) for low, high in box),
-        **kind.of_keys({d.key: getattr(keys, d.key) for d in kind.keys}),
+        **{d.name: d.to_si(v if d.separator else [v]) for d, v in stated.items()},
     )
-    problem = dimensions.find_problem()
-    if problem:
+    if problem := dimensions.find_problem():
         key = next(d.key for d in kind.keys if d.name == problem[0])
         raise RobotError(problem[1], where=f"{path}: {key}")
     counting = tuple(getattr(keys.joints, drive).to_counting() for drive in kind.drives_of())
-    joints_problem = find_counting_problem(counting, len(counting))
-    if joints_problem:
+    if joints_problem := find_counting_problem(counting, len(counting)):
         raise RobotError(joints_problem, where=f"{path}: joints")
     return dimensions, counting
 
@@ -137,8 +135,9 @@ def machine_text(dimensions: Dimensions, counting: tuple[Counting, ...]) -> str:
         lines.append(f"{d.key}: {d.show(getattr(dimensions, d.name))}")
     box = box_text(dimensions.workspace)
     usual = box_text([(-0.06, 0.06)] * len(kind.coordinates))
+    axes = f"{', '.join(kind.coordinates[:-1])} and {kind.coordinates[-1]}"
     lines += [
-        f"# Limits of {kind.axes_words()} relative to the mechanical zero, where the tool works.",
+        f"# Limits of {axes} relative to the mechanical zero, where the tool works.",
         f"# Without them: {kind.usual_workspace}.",
         f"workspace_mm: {box}" if box else f"# workspace_mm: {usual}",
         "# Joints of the controller: whether they count up or down as the coordinate of a slide",

@@ -24,7 +24,7 @@ from orthocal.builder.dimensions import (
     in_mm,
     in_unit,
 )
-from orthocal.builder.leg_urdf import Body, LegGeometry, Shape, coloured, machine_urdf
+from orthocal.builder.leg_urdf import LEG_COLOURS, Body, LegGeometry, Shape, machine_urdf
 from orthocal.builder.robot_yaml import length_sums, platform_loops, robot_yaml
 from orthocal.units import DEG
 
@@ -116,7 +116,7 @@ class SlidingLegs(Dimensions):
     def legs(self) -> list[LegGeometry]:
         """Legs in the mechanical zero."""
         legs = []
-        for (name, colour), frame in zip(coloured(self.letters), self.frames(), strict=True):
+        for name, colour, frame in zip(self.letters, LEG_COLOURS, self.frames(), strict=False):
             outwards = -frame[:, 0]
             slide, tip = self.leg * outwards, self.attachment * outwards
             root = slide + tip

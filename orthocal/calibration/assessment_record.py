@@ -15,7 +15,7 @@ import numpy as np
 
 from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.io.documents import Number, write_plain
-from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
+from orthocal.io.fields import FileRecord, Many, NumberOrNaN, SizeOrNaN
 from orthocal.kinematics.conditions import StatedUse, UseCondition
 from orthocal.kinematics.workspace import describe_box
 from orthocal.units import InUnit, Unit
@@ -112,10 +112,8 @@ FindingKind = Literal[
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Place(FileRecord):
     """Place of a finding; None where a field does not apply."""
-
-    __pydantic_config__ = CLOSED
 
     file: str | None = None
     line: int | None = None
@@ -126,10 +124,8 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finding:
+class Finding(FileRecord):
     """Finding of the assessment, about readings or a result."""
-
-    __pydantic_config__ = CLOSED
 
     kind: FindingKind
     severity: Severity
@@ -153,10 +149,8 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Decision:
+class Decision(FileRecord):
     """Verdict with its reason and the next step."""
-
-    __pydantic_config__ = CLOSED
 
     verdict: Verdict
     headline: str
@@ -181,10 +175,8 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ControllerEntry(InUnit):
+class ControllerEntry(FileRecord, InUnit):
     """Value to enter into the controller for one drive."""
-
-    __pydantic_config__ = CLOSED
 
     drive: str
     unit: Unit
@@ -223,10 +215,8 @@ class ControllerEntry(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BacklashEntry(InUnit):
+class BacklashEntry(FileRecord, InUnit):
     """Backlash of one drive for the controller to compensate."""
-
-    __pydantic_config__ = CLOSED
 
     drive: str
     unit: Unit
@@ -253,10 +243,8 @@ class BacklashEntry(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UsePart:
+class UsePart(FileRecord):
     """Contribution of a varying condition of use to the tool error, RMS, [m]."""
-
-    __pydantic_config__ = CLOSED
 
     condition: UseCondition
     effects: Many[str]
@@ -273,10 +261,8 @@ class UsePart:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToolUse:
+class ToolUse(FileRecord):
     """Conditions of use of a tool error. A condition is None if no effect depends on it."""
-
-    __pydantic_config__ = CLOSED
 
     approach: str | None
     """Letter for each drive: p or n for one side of approach, u for both."""
@@ -297,14 +283,12 @@ class ToolUse:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToolErrorSummary:
+class ToolErrorSummary(FileRecord):
     """Expected RMS error of the tool over the workspace, [m].
 
     "Aligned" errors are those after aligning the workpiece on the machine: the best-fit translation
     and rotation are removed. "Absolute" errors are in coordinates of the machine.
     """
-
-    __pydantic_config__ = CLOSED
 
     box: Many[tuple[Number, Number]]
     """Workspace: lowest and highest value of each coordinate, [m]."""
@@ -333,10 +317,8 @@ class ToolErrorSummary:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Assessment:
+class Assessment(FileRecord):
     """Assessment of a calibration or of readings."""
-
-    __pydantic_config__ = CLOSED
 
     decision: Decision
     findings: Many[Finding]

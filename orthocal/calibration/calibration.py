@@ -1,4 +1,4 @@
-"""Result of a calibration: its record and derived quantities.
+"""Result of a calibration: its record, derived quantities, and the kinematics of its machine.
 
 It contains everything that reports, scenes and exports need. None of them reads the session.
 """
@@ -6,25 +6,98 @@ It contains everything that reports, scenes and exports need. None of them reads
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arguments import require_kind
+from orthocal.arguments import require_kind, require_numbers
 from orthocal.arrays import Array, Mask
-from orthocal.calibration.machine import Machine
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.effects.compensation import displace_drives
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
-from orthocal.kinematics.conditions import APPROACH
+from orthocal.kinematics.conditions import APPROACH, UseConditions
+from orthocal.kinematics.loop_closure import LoopClosure, as_rows, require_within_travel
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import suggest
 from orthocal.sensors.protocol import is_difference
 from orthocal.statistics.chance import bounded_interval, expanded_uncertainty
 from orthocal.statistics.noise import MIN_DOF
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Machine:
+    """Kinematics of a robot with error parameters."""
+
+    robot: Robot
+    errors: Mapping[str, float]
+    """Parameter to value, such as {"x_slide.offset": 1e-3}, [SI]; absent ones are 0."""
+
+    def __post_init__(self) -> None:
+        require_kind(self.robot, Robot, expected="a Robot, such as load_robot(...)")
+        require_numbers(self.errors, argument="errors")
+        object.__setattr__(self, "errors", dict(self.errors))
+
+    def forward(
+        self,
+        joints: ArrayLike,
+        *,
+        names: Sequence[str] | None = None,
+        conditions: UseConditions | None = None,
+    ) -> Array:
+        """Tool centre point for drive coordinates.
+
+        Args:
+            joints: Drive coordinates of the encoders, without offsets of the controller, shape
+                (K, n_drives) or (n_drives,), [m, rad].
+            names: Names of the rows, for messages.
+            conditions: Conditions of use; by default the mean of both sides of approach, the
+                reference temperature and no payload.
+
+        Returns:
+            Tool positions, shape (K, 3) or (3,), [m].
+
+        Raises:
+            ClosureError: If the machine cannot reach such coordinates.
+            ParameterError: If a condition is out of range, or nothing depends on it.
+        """
+        rows, single = as_rows(joints, len(self.robot.drives), "drive coordinates")
+        require_within_travel(self.robot, rows, names)
+        points = self._closure(conditions).forward(rows, names=names)
+        return points[0] if single else points
+
+    def inverse(
+        self,
+        points: ArrayLike,
+        *,
+        names: Sequence[str] | None = None,
+        conditions: UseConditions | None = None,
+    ) -> Array:
+        """Drive coordinates for tool positions.
+
+        Args:
+            points: Commanded coordinates of the tool, shape (K, n_coordinates) or
+                (n_coordinates,), [m]; or positions, shape (K, 3) or (3,).
+            names: Names of the rows, for messages.
+            conditions: Conditions of use, as for `forward`.
+
+        Returns:
+            Drive coordinates of the encoders, shape (K, n_drives) or (n_drives,), [m, rad].
+
+        Raises:
+            ClosureError: If a point cannot be reached.
+            ParameterError: If a condition is out of range, or nothing depends on it.
+        """
+        return self._closure(conditions).inverse(points, names=names)
+
+    def _closure(self, conditions: UseConditions | None) -> LoopClosure:
+        """Loop closures of the machine under conditions of use."""
+        use = UseConditions() if conditions is None else conditions
+        require_kind(use, UseConditions, expected="UseConditions, such as UseConditions('ppp')")
+        use.require_valid(self.robot)
+        return LoopClosure(self.robot, fixed=self.errors, conditions=use)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -6,7 +6,6 @@ The embedded files are those of the calibrated robot. Its original directory may
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import logging
 import os
@@ -129,7 +128,7 @@ def _read_content(file: RobotFile, where: str) -> bytes:
             content = (file.text or "").encode()
         else:
             content = base64.b64decode(file.base64, validate=True)
-    except (binascii.Error, ValueError):
+    except ValueError:
         raise CalibrationFileError("is not base64", where=f"{where}.base64") from None
     digest = hashlib.sha256(content).hexdigest()
     if digest != file.sha256:

@@ -16,7 +16,7 @@ from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
-from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
+from orthocal.io.fields import FileRecord, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.robot.files import MOST_FILES, is_inner_path
@@ -30,10 +30,8 @@ from orthocal.units import InUnit, Unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Versions:
+class Versions(FileRecord):
     """Versions of the software that made a calibration."""
-
-    __pydantic_config__ = CLOSED
 
     orthocal: str
     python: str
@@ -54,10 +52,8 @@ InnerPath = Annotated[str, AfterValidator(_require_inner_path)]
 
 
 @dataclass(frozen=True, slots=True)
-class RobotFile:
+class RobotFile(FileRecord):
     """File of the calibrated robot."""
-
-    __pydantic_config__ = CLOSED
 
     name: InnerPath
     """Path in the robot's directory."""
@@ -69,10 +65,8 @@ class RobotFile:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotRecord:
+class RobotRecord(FileRecord):
     """The calibrated robot with its files."""
-
-    __pydantic_config__ = CLOSED
 
     name: InnerPath
     reference: str
@@ -97,10 +91,8 @@ class RobotRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SessionRecord:
+class SessionRecord(FileRecord):
     """The calibrated session."""
-
-    __pydantic_config__ = CLOSED
 
     path: str | None
     readings_path: str | None
@@ -126,10 +118,8 @@ class SessionRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SolverRecord:
+class SolverRecord(FileRecord):
     """Solver, its settings and its result."""
-
-    __pydantic_config__ = CLOSED
 
     name: SolverKind
     status: str
@@ -157,10 +147,8 @@ class SolverRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ParameterEstimate(InUnit):
+class ParameterEstimate(FileRecord, InUnit):
     """Estimate of one error parameter."""
-
-    __pydantic_config__ = CLOSED
 
     name: str
     unit: Unit
@@ -206,10 +194,8 @@ class ParameterEstimate(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PostureRecord(Posture):
+class PostureRecord(Posture, FileRecord):
     """A posture of the session."""
-
-    __pydantic_config__ = CLOSED
 
     values: Vector
     drives: Vector
@@ -218,10 +204,8 @@ class PostureRecord(Posture):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GaugeRecord:
+class GaugeRecord(FileRecord):
     """A gauge that was read."""
-
-    __pydantic_config__ = CLOSED
 
     name: str
     """Name; "" if it is the only gauge."""
@@ -238,10 +222,8 @@ class GaugeRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SetupRecord:
+class SetupRecord(FileRecord):
     """A setup of the session."""
-
-    __pydantic_config__ = CLOSED
 
     name: str
     sensor: Annotated[RecordedSensor, Field(alias="reads")]
@@ -265,14 +247,12 @@ class SetupRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CalibrationRecord:
+class CalibrationRecord(FileRecord):
     """Identified error parameters of a robot, with their uncertainty and provenance, as plain data.
 
     The record contains everything that is needed to repeat the calibration: readings, postures,
     sensors, gauges, free and known parameters, bounds and priors.
     """
-
-    __pydantic_config__ = CLOSED
 
     versions: Versions
     robot_record: Annotated[RobotRecord, Field(alias="robot")]

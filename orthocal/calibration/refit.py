@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.calibration.build_record import assemble_calibration
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, require_calibration
 from orthocal.estimation.fit import Fit, find_mounting_covariance, fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
@@ -193,7 +192,7 @@ def restore_session(calibration: Calibration) -> Session:
 
     `repeat_calibration(calibration, restore_session(calibration))` reproduces the calibration.
     """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_calibration(calibration)
     record, robot = calibration.session, calibration.robot
     offsets = record.controller_offsets
     gauges = {g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges}

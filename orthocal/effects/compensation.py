@@ -18,15 +18,13 @@ from pydantic import Field
 from orthocal.arrays import Array
 from orthocal.effects.loading import robot_effects
 from orthocal.io.documents import Number
-from orthocal.io.fields import CLOSED, Matrix
+from orthocal.io.fields import FileRecord, Matrix
 from orthocal.robot.model import Drive, Robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointTrim:
+class JointTrim(FileRecord):
     """Trim that a controller adds to the position of one joint, and the joint's home position."""
-
-    __pydantic_config__ = CLOSED
 
     backlash: Annotated[Number, Field(ge=0.0)] = 0.0
     """Compensated backlash, [m, rad]; a table replaces it."""

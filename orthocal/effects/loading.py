@@ -96,15 +96,17 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
 @lru_cache(maxsize=4 * MAX_LOADED)
 def _choose_effects(robot: Robot, chosen: tuple[str, ...] | None) -> Robot:
     """Robot with ordered names of effects, cached."""
-    plain = replace(robot, chosen_effects=chosen, parameters=ParameterSet())
-    return _add_parameters(plain).with_tolerances(robot.parameters.stated)
+    return _with_parameters(replace(robot, chosen_effects=chosen))
 
 
 def with_adjustments(robot: Robot) -> Robot:
     """Robot whose placements depend on the mechanical adjustments of each session."""
-    if robot.adjusted:
-        return robot
-    plain = replace(robot, adjusted=True, parameters=ParameterSet())
+    return robot if robot.adjusted else _with_parameters(replace(robot, adjusted=True))
+
+
+def _with_parameters(robot: Robot) -> Robot:
+    """Robot with the parameters of its present effects, and the tolerances stated before."""
+    plain = replace(robot, parameters=ParameterSet())
     return _add_parameters(plain).with_tolerances(robot.parameters.stated)
 
 
@@ -120,20 +122,19 @@ def _add_parameters(robot: Robot) -> Robot:
                     f"its parameter '{error.name}' exists already",
                     where=f"{where}.effects.{effect.name}",
                 )
-    elementary, models = tuple(errors.values()), dict(declared.models)
-    for name, patterns in MODELS.items():
-        models.setdefault(name, patterns)
+    elementary, stated = tuple(errors.values()), declared.models
+    models = {**stated, **{name: p for name, p in MODELS.items() if name not in stated}}
     try:
         parameters = build_parameters(
             elementary,
-            sums=declared.sums,
+            sums=declared.parameters,
             overrides=_read_tolerances(robot).overrides,
             models=models,
             find_redundant=partial(find_redundant_errors, robot, elementary),
             further=adjustment_parameters(robot, errors),
         )
     except ParameterError as e:
-        raise RobotError(e.problem, where=where) from None
+        raise RobotError(str(e), where=where) from None
     return replace(robot, parameters=parameters)
 
 
@@ -193,10 +194,5 @@ def reading_effects(robot: Robot) -> tuple[Effect, ...]:
 
 def _read_tolerances(robot: Robot) -> ToleranceKeys:
     """Tolerances in the robot's YAML."""
-    return validate(
-        ToleranceKeys,
-        robot.declared.tolerances,
-        where=str(robot.yaml),
-        error=RobotError,
-        under="orthocal.tolerances",
-    )
+    where, under, data = str(robot.yaml), "orthocal.tolerances", robot.declared.tolerances
+    return validate(ToleranceKeys, data, where=where, error=RobotError, under=under)

@@ -13,15 +13,13 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.io.documents import PositiveInSI
-from orthocal.io.fields import CLOSED, SizeOrInf
+from orthocal.io.fields import FileRecord, SizeOrInf
 from orthocal.robot.parameters import ParameterSet
 
 
 @dataclass(frozen=True, slots=True)
-class ToleranceScale:
+class ToleranceScale(FileRecord):
     """Factor on the tolerances, and the information from which it was estimated."""
-
-    __pydantic_config__ = CLOSED
 
     factor: PositiveInSI = 1.0
     """Factor; 1 if errors within the tolerances explain the readings."""

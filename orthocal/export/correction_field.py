@@ -20,7 +20,6 @@ corrected exactly.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import product
 from typing import Literal
 
@@ -77,14 +76,6 @@ Fallback = Literal["divided", "exact"]
 """Treatment of a box without a polynomial."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Box:
-    """A polynomial of corrections and its error, [m]."""
-
-    correction: Polynomial
-    error: float
-
-
 class CorrectionField:
     """Points to command for desired points of the tool.
 
@@ -124,12 +115,12 @@ class CorrectionField:
         if aligned_over is not None:
             self._rotation, self._translation = self._align(aligned_over)
         self._side = BOX_SIDE * robot.characteristic_length
-        self._boxes: dict[Key, _Box | Fallback] = {}
+        self._boxes: dict[Key, Polynomial | Fallback] = {}
         self.error = EXACT_ERROR
         """Largest estimated error of the polynomials in use, [m]."""
         n = len(self.axes)
         line = chebyshev_line(NODES_PER_AXIS)
-        self._nodes = grid_points(line, n)
+        self._nodes = grid_points(*[line] * n)
         self._fit = PolynomialFit(
             self._nodes, np.array(list(product(range(NODES_PER_AXIS), repeat=n)))
         )
@@ -140,7 +131,7 @@ class CorrectionField:
             / (NODES_PER_AXIS - 1)
         )
         random = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_CHECKS, n))
-        self._checks = np.vstack([grid_points(between, n), random])
+        self._checks = np.vstack([grid_points(*[between] * n), random])
 
     def __call__(self, points: Array) -> tuple[Array, Mapping[int, str]]:
         """Points to command.
@@ -251,29 +242,27 @@ class CorrectionField:
         corrections = np.empty_like(points)
         for group, cell in _group(_cells(points, self._side / 2**halvings)):
             box = self._box((halvings, *cell))
-            if isinstance(box, _Box):
-                corrections[group] = box.correction(points[group])
-            elif box == "divided":
+            if box == "divided":
                 corrections[group] = self._corrections(
                     points[group], indices[group], halvings + 1, exact
                 )
-            else:
+            elif box == "exact":
                 exact.extend(indices[group].tolist())
                 corrections[group] = np.nan
+            else:
+                corrections[group] = box(points[group])
         return corrections
 
-    def _box(self, key: Key) -> _Box | Fallback:
-        """Box with its polynomial, cached."""
+    def _box(self, key: Key) -> Polynomial | Fallback:
+        """Polynomial of the corrections in a box, or its fallback, cached."""
         if key not in self._boxes:
             if len(self._boxes) >= MAX_BOXES:
                 self._boxes.pop(next(iter(self._boxes)))
-            box = self._boxes[key] = self._make(key)
-            if isinstance(box, _Box):
-                self.error = max(self.error, box.error)
+            self._boxes[key] = self._make(key)
         return self._boxes[key]
 
-    def _make(self, key: Key) -> _Box | Fallback:
-        """Compute the polynomial of a box, or decide its fallback."""
+    def _make(self, key: Key) -> Polynomial | Fallback:
+        """Compute the polynomial of a box and count its error, or decide its fallback."""
         fallback: Fallback = "divided" if key[0] < MAX_HALVINGS else "exact"
         side = self._side / 2 ** key[0]
         middle = (np.array(key[1:]) + 0.5) * side
@@ -294,7 +283,10 @@ class CorrectionField:
             return fallback
         largest = float(np.linalg.norm(correction(checks) + checks - expected, axis=1).max())
         error = SAFETY_FACTOR * largest + EXACT_ERROR
-        return fallback if error > self.bound else _Box(correction, error)
+        if error > self.bound:
+            return fallback
+        self.error = max(self.error, error)
+        return correction
 
 
 def command_points(tip: ToolTip, offsets: Array, points: Array) -> tuple[Array, Mapping[int, str]]:

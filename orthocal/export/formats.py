@@ -129,14 +129,13 @@ def export_calibration(
     options = options or ExportOptions()
     if to not in EXPORTERS:
         files = export_linuxcnc(calibration, options)
+        files = _add_warning(files, note_wrong_order(calibration))
     elif options.requested:
         raise ParameterError(
             "is an option of --to linuxcnc only", where=OPTIONS[options.requested[0]]
         )
     else:
         files = EXPORTERS[to](calibration)
-    if to == "linuxcnc":
-        files = _add_warning(files, note_wrong_order(calibration))
     return _add_warning(files, warn_against_verdict(calibration))
 
 

@@ -26,8 +26,13 @@ from orthocal.io.documents import LARGEST_NUMBER, Number
 
 Item = TypeVar("Item")
 
-CLOSED = ConfigDict(extra="forbid")
-"""Configuration of a record that refuses unknown keys."""
+
+class FileRecord:
+    """Base of the records that files contain; unknown keys are refused."""
+
+    __slots__ = ()
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
 
 Many = Annotated[tuple[Item, ...], Field(fail_fast=True)]
 """Any number of items; validation stops at the first invalid one."""

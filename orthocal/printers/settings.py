@@ -23,7 +23,7 @@ from pydantic import Field
 from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number
-from orthocal.io.fields import CLOSED
+from orthocal.io.fields import FileRecord
 from orthocal.units import DEG, MM
 
 FirmwareName = Literal["klipper", "marlin", "marlin1", "reprapfirmware"]
@@ -50,10 +50,8 @@ RODS_PER_RADIUS = (1.2, 5.0)
 
 
 @dataclass(frozen=True, slots=True)
-class DeltaSettings:
+class DeltaSettings(FileRecord):
     """Settings of a firmware."""
-
-    __pydantic_config__ = CLOSED
 
     firmware: FirmwareName
     radius: Positive

@@ -40,7 +40,7 @@ from orthocal.robot.model import (
     coordinate_limits,
     joint_axis,
 )
-from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
+from orthocal.robot.parameters import AXES, ParameterSet, split_unit
 from orthocal.robot.reference_posture import find_reference_posture
 from orthocal.robot.urdf import load_urdf
 from orthocal.text import shorten
@@ -187,13 +187,7 @@ def _build_robot(
         workspace=_read_workspace(keys, where),
         bed=_read_bed(keys, where),
         use=_read_use(keys, where),
-        declared=DeclaredErrors(
-            tolerances=keys.orthocal.tolerances,
-            effects=keys.orthocal.effects,
-            sums=keys.orthocal.parameters,
-            models=keys.orthocal.models,
-            adjustments=keys.orthocal.adjustments,
-        ),
+        declared=keys.orthocal,
         parameters=ParameterSet(),
         drive_index=drive_index,
         passive_index=passive_index,

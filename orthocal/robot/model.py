@@ -17,8 +17,9 @@ from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
+from orthocal.robot.description import OrthocalKeys
 from orthocal.robot.frames import Placement, find_frame, place_frames
-from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
+from orthocal.robot.parameters import ElementaryError, ParameterSet
 from orthocal.units import DRIVE_UNITS, InUnit, Unit, format_fixed
 
 PARALLEL_SINE = 0.02
@@ -236,8 +237,8 @@ class Robot:
     a machine without a bed."""
     use: Use
     """Conditions under which the machine is used."""
-    declared: DeclaredErrors
-    """Errors declared in the YAML, for `orthocal.effects`."""
+    declared: OrthocalKeys
+    """Keys of the YAML, among them the errors that `orthocal.effects` reads."""
     parameters: ParameterSet
     """Error parameters, from `orthocal.effects.loading`."""
     drive_index: Indices
@@ -583,9 +584,7 @@ def drive_keys(
         values: Value of each drive, [m, rad]; 0 by default.
     """
     texts: dict[str, list[str]] = {}
-    if values is None:
-        values = [0.0] * len(drives)
-    for drive, value in zip(drives, values, strict=True):
+    for drive, value in zip(drives, values or [0.0] * len(drives), strict=True):
         texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.6g}")
     return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
 

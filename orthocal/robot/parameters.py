@@ -10,10 +10,10 @@ import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -83,22 +83,6 @@ class ElementaryError:
 
     def __post_init__(self) -> None:
         require_prior(self.name, self.unit, self.prior_std)
-
-
-@dataclass(frozen=True, slots=True)
-class DeclaredErrors:
-    """Errors declared in a robot's YAML, as plain data for `orthocal.effects`."""
-
-    tolerances: Mapping[str, Any]
-    """Key `orthocal.tolerances`."""
-    effects: Mapping[str, Mapping[str, Any]]
-    """Key `orthocal.effects`: names of effects, mapped to their keys."""
-    sums: Mapping[str, Sequence[str]]
-    """Key `orthocal.parameters`: names of sums, mapped to elementary errors; '-' subtracts."""
-    models: Mapping[str, Sequence[str]]
-    """Key `orthocal.models`: names of models, mapped to patterns or COMPLETE."""
-    adjustments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Key `orthocal.adjustments`: names of mechanical adjustments, mapped to their keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -478,10 +462,8 @@ def build_parameters(
         parameters[parameter.name] = parameter
     for key, value in overrides.items():
         glob, unit, factor = split_unit(key)
-        try:
+        with errors_at("tolerances.overrides"):
             names = _match(glob, parameters)
-        except ParameterError as e:
-            raise ParameterError(f"tolerances.overrides: {e.problem}") from None
         for name in names:
             _check_unit(key, unit, parameters[name])
             parameters[name] = replace(parameters[name], prior_std=read_limit(value) * factor)
@@ -489,10 +471,8 @@ def build_parameters(
     for model, patterns in models.items():
         if patterns == COMPLETE:
             continue
-        try:
+        with errors_at(f"models.{model}"):
             chosen = result.select(patterns)
-        except ParameterError as e:
-            raise ParameterError(f"models.{model}: {e.problem}") from None
         if not chosen:
             raise ParameterError(f"models.{model}: selects no error parameter")
     return result

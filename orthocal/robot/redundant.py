@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 import pinocchio as pin
@@ -55,7 +56,7 @@ def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -
     frames = [robot.frame_id(name) for name in dict.fromkeys(observed)]
     masks = _carried_masks(robot, owners, frames)
     effects = np.zeros(len(errors))
-    for coordinates in _random_postures(robot):
+    for coordinates in islice(_random_postures(robot), N_POSTURES):
         sensitivity = _sensitivity(robot, owners, frames, masks, coordinates)
         effects = np.maximum(effects, np.abs(sensitivity).max(axis=0)[columns])
     rotations = np.array([e.axis >= 3 for e in errors], dtype=np.bool_)
@@ -73,7 +74,7 @@ def _random_postures(robot: Robot) -> Iterator[Array]:
     unlimited = ~np.isfinite(upper)
     lower = np.where(unlimited, zero - UNLIMITED_TRAVEL, lower)
     upper = np.where(unlimited, zero + UNLIMITED_TRAVEL, upper)
-    count, fraction = 0, 0.5
+    fraction = 0.5
     for _ in range(MAX_ATTEMPTS):
         drives = zero + fraction * (rng.uniform(lower, upper) - zero)
         try:
@@ -82,9 +83,6 @@ def _random_postures(robot: Robot) -> Iterator[Array]:
             fraction *= 0.8
             continue
         yield robot.joint_coordinates(drives, passive)
-        count += 1
-        if count == N_POSTURES:
-            return
 
 
 def _carried_masks(

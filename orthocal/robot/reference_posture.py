@@ -150,7 +150,7 @@ def _starts(robot: Robot, start: Array, free: Indices) -> Iterator[Array]:
     """Start, then random starts around it that differ in the free coordinates."""
     yield start
     rng = np.random.default_rng(0)
-    stds = START_SPREAD * _coordinate_scales(robot)
+    stds = START_SPREAD * (robot.characteristic_length / coordinate_units(robot))
     operations = MAX_STEPS * robot.closure_rows * robot.model.nv**2
     for _ in range(min(MAX_STARTS - 1, int(MAX_OPERATIONS / max(operations, 1)))):
         change = np.zeros(len(start))
@@ -170,7 +170,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
         movable: Indices of the drives that may move.
         target: Joint coordinates with the drives at their zeros, shape (nv,), [m, rad].
     """
-    scales = _coordinate_scales(robot)
+    scales = robot.characteristic_length / coordinate_units(robot)
     values = _singular_values(robot, closing)
     independent = values > NULL_SPACE_TOLERANCE  # others belong to dependent rows
     smallest = SINGULARITY_MARGIN * values[independent][-1:]  # none without passive joints
@@ -218,11 +218,6 @@ def _singular_values(robot: Robot, closing: Closing) -> Array:
     scaled = _scaled_jacobian(robot, closing.coordinates)
     values = np.linalg.svd(scaled[:, robot.passive_index], compute_uv=False)
     return np.asarray(values / max(float(values.max(initial=0.0)), 1e-300))
-
-
-def _coordinate_scales(robot: Robot) -> Array:
-    """Scale of each coordinate, shape (nv,): 1 rad or the characteristic length."""
-    return np.where(coordinate_turns(robot.model), 1.0, robot.characteristic_length)
 
 
 def _null_space(matrix: Array) -> Array:

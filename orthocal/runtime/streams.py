@@ -130,9 +130,7 @@ def guarded_streams() -> Iterator[None]:
 
 
 @contextmanager
-def announced_if_slow(
-    text: str, *, after: float = PATIENCE, descriptor: int = STDERR
-) -> Iterator[None]:
+def announced_if_slow(text: str) -> Iterator[None]:
     """Print a line on the terminal of stderr if the block lasts longer than a few seconds.
 
     Nothing is printed into files and pipes. The timer of the process is used instead of a thread,
@@ -140,20 +138,18 @@ def announced_if_slow(
 
     Args:
         text: The line.
-        after: Time after which the line is printed, [s].
-        descriptor: File descriptor of the terminal.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
-    if not (hasattr(signal, "setitimer") and in_main_thread and os.isatty(descriptor)):
+    if not (hasattr(signal, "setitimer") and in_main_thread and os.isatty(STDERR)):
         yield
         return
 
     def announce(*_: object) -> None:
         with suppress(OSError):
-            os.write(descriptor, f"{text}\n".encode(errors="replace"))
+            os.write(STDERR, f"{text}\n".encode(errors="replace"))
 
     previous = signal.signal(signal.SIGALRM, announce)
-    signal.setitimer(signal.ITIMER_REAL, after)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)
     try:
         yield
     finally:

@@ -63,10 +63,8 @@ class CompiledReading:
     the second posture follow."""
     expression: ca.Function
     """Function with the outputs of `jacobian` as sparse rows, for use in other expressions."""
-    name: str
-    """Name that is unique among the readings of the robot."""
-    conditions: tuple[Condition, ...]
-    """Conditions that follow the constants of the sensor in the inputs."""
+    pattern: ReadingPattern
+    """Pattern of the sensors."""
     pairs: bool
     """Whether a reading belongs to a pair of postures."""
     probe: float | None
@@ -79,7 +77,7 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     Raises:
         OrthocalError: If sensors of one kind and with the same frames have different expressions.
     """
-    pattern = _Pattern(robot, sensor, sensor.frames(robot))
+    pattern = ReadingPattern(robot, sensor, sensor.frames(robot))
     reading = _compile(pattern)
     if reading.probe is not None and not np.array_equal(
         _probe(pattern), reading.probe, equal_nan=True
@@ -91,12 +89,13 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     return reading
 
 
-class _Pattern:
+class ReadingPattern:
     """Key of a sensor's expression; sensors with equal patterns share compiled functions."""
 
     def __init__(self, robot: Robot, sensor: Sensor, frames: Frames) -> None:
         self.robot, self.sensor, self.frames = robot, sensor, frames
         self.conditions = reading_conditions(robot, sensor)
+        """Conditions that follow the constants of the sensor in the inputs."""
         sizes = (condition_size(robot, c) for c in self.conditions)
         self.n_constants = np.size(sensor.constants(robot)) + sum(sizes)
         effect_errors = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
@@ -111,11 +110,6 @@ class _Pattern:
             self.conditions,
             source_digest(type(sensor)),
         )
-
-    @property
-    def pairs(self) -> bool:
-        """True if a reading belongs to a pair of postures."""
-        return bool(self.frames.in_second)
 
     @property
     def name(self) -> str:
@@ -145,47 +139,43 @@ class _Pattern:
         return _express(self)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Pattern) and self._key == other._key
+        return isinstance(other, ReadingPattern) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
 
 
 @lru_cache(maxsize=256)
-def _compile(pattern: _Pattern) -> CompiledReading:
+def _compile(pattern: ReadingPattern) -> CompiledReading:
     """Compile the functions of a pattern, or load them from the cache."""
     keys = [function_key(f"{name} {pattern.name}", *pattern.digests) for name in FUNCTIONS]
     value, jacobian = (
-        cached_function(key, partial(build, pattern))
-        for key, build in zip(keys, (_build_value, _build_jacobian), strict=True)
+        cached_function(key, partial(_build, pattern, name))
+        for key, name in zip(keys, FUNCTIONS, strict=True)
     )
     rows = [name for name in jacobian.name_out() if name not in ("h", "by_twists")]
     return CompiledReading(
         value=BatchFunction(value, key=keys[0]),
         jacobian=BatchFunction(jacobian, matrices=rows, sparse=["by_twists"], key=keys[1]),
         expression=jacobian,
-        name=pattern.name,
-        conditions=pattern.conditions,
-        pairs=pattern.pairs,
+        pattern=pattern,
+        pairs=bool(pattern.frames.in_second),
         probe=_probe(pattern) if source_digest(type(pattern.sensor)) else None,
     )
 
 
-def _build_value(pattern: _Pattern) -> ca.Function:
-    inputs, outputs = pattern.expressions
-    names = [*INPUTS, *SECOND_INPUTS[: len(inputs) - len(INPUTS)]]
-    return ca.Function("h", inputs, [ca.densify(outputs[0])], names, ["h"])
-
-
-def _build_jacobian(pattern: _Pattern) -> ca.Function:
+def _build(pattern: ReadingPattern, name: str) -> ca.Function:
+    """Build one of the functions of a pattern."""
     inputs, outputs = pattern.expressions
     second = SECOND_INPUTS[: len(inputs) - len(INPUTS)]
+    if name == FUNCTIONS[0]:
+        return ca.Function("h", inputs, [ca.densify(outputs[0])], [*INPUTS, *second], ["h"])
     variables = ("actuated", "passive", "twists", "zero", "nuisance", *second)
     labels = ["h", *(f"by_{name}" for name in variables)]
     return ca.Function("jacobian", inputs, outputs, [*INPUTS, *second], labels)
 
 
-def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
+def _express(pattern: ReadingPattern) -> tuple[list[ca.SX], list[ca.SX]]:
     """Inputs and outputs of the compiled functions, as in `CompiledReading.jacobian`.
 
     Each frame contributes fᵀ ∂p + mᵀ ∂φ to the derivatives, with f and m the force and moment that
@@ -194,20 +184,15 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     robot = pattern.robot
     here: RobotFunctions = robot_functions(robot)
     there = here.reference
-    constants = ca.SX.sym("constants", pattern.n_constants)
-    nuisance = ca.SX.sym("nuisance", len(pattern.nuisance_parameters))
     trees = [
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
         *((here.second, robot.frame_id(f)) for f in pattern.frames.in_second),
     ]
-    poses, h = _sensor_expression(pattern, constants, nuisance)
-    wrenches = [_wrench(h, pose) for pose in poses]
-    local = ca.Function(
-        "sensor",
-        [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, nuisance],
-        [h, *(v for wrench in wrenches for v in wrench), ca.jacobian(h, nuisance)],
-    )
+    poses, symbols, h = _sensor_expression(pattern)
+    constants, nuisance = symbols[-2:]
+    wrenches = (v for pose in poses for v in _wrench(h, pose))
+    local = ca.Function("sensor", symbols, [h, *wrenches, ca.jacobian(h, nuisance)])
     actual_poses = [machine.tree.frame_pose(frame) for machine, frame in trees]
     arguments = (s for pose in actual_poses for s in (pose.rotation, pose.position))
     values = local(*arguments, constants, nuisance)
@@ -227,16 +212,19 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
             by_coordinates[machine] = by_actuated + actuated, by_passive + passive
     inputs = [*here.symbols, there.actuated, constants, nuisance]
     outputs = [value, *by_coordinates[here], by_twists, by_zero, by_nuisance]
-    if pattern.pairs:
+    if pattern.frames.in_second:
         inputs += [here.second.actuated, here.second.passive]
         outputs += by_coordinates[here.second]
     return inputs, outputs
 
 
-def _sensor_expression(
-    pattern: _Pattern, constants: ca.SX, nuisance: ca.SX
-) -> tuple[list[Pose], ca.SX]:
-    """Symbols of the poses of a sensor's frames, and its reading as an expression of them."""
+def _sensor_expression(pattern: ReadingPattern) -> tuple[list[Pose], list[ca.SX], ca.SX]:
+    """Poses of a sensor's frames, all symbols, and the reading as an expression of them.
+
+    The symbols are rotation and position of each pose, the constants and the nuisance parameters.
+    """
+    constants = ca.SX.sym("constants", pattern.n_constants)
+    nuisance = ca.SX.sym("nuisance", len(pattern.nuisance_parameters))
     frames, at_zero, second = (
         [Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3)) for _ in names]
         for names in (pattern.frames.in_posture, pattern.frames.at_zero, pattern.frames.in_second)
@@ -244,7 +232,9 @@ def _sensor_expression(
     h = express_reading(
         pattern.robot, pattern.sensor, frames, at_zero, constants, nuisance, second=second
     )
-    return [*frames, *at_zero, *second], h
+    poses = [*frames, *at_zero, *second]
+    symbols = [s for pose in poses for s in (pose.rotation, pose.position)]
+    return poses, [*symbols, constants, nuisance], h
 
 
 def express_reading(
@@ -295,12 +285,9 @@ def reading_conditions(robot: Robot, sensor: Sensor) -> tuple[Condition, ...]:
     return tuple(c for c in NEUTRAL if c in needed)
 
 
-def _probe(pattern: _Pattern) -> float:
+def _probe(pattern: ReadingPattern) -> float:
     """Reading of a sensor at fixed arguments, which is equal for equal expressions."""
-    constants = ca.SX.sym("constants", pattern.n_constants)
-    nuisance = ca.SX.sym("nuisance", len(pattern.nuisance_parameters))
-    poses, h = _sensor_expression(pattern, constants, nuisance)
-    symbols = [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, nuisance]
+    _, symbols, h = _sensor_expression(pattern)
     rng = np.random.default_rng(0)
     values = [ca.DM(rng.uniform(0.1, 1.0, s.shape)) for s in symbols]
     return float(ca.Function("probe", symbols, [h])(*values))

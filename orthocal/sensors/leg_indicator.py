@@ -335,13 +335,11 @@ class LegIndicator:
         root, end = (pose.position for pose in view.frames)
         c = view.constants
         direction, axis, side, start = _place(c, [pose.position for pose in view.at_zero])
-        gauge = mount(
+        shift, plunger, edge, scale = mount(
             self.nuisance_parameters, view.nuisance, direction=direction, side=side, axis=axis
         )
-        reading = type(self).touch(
-            root, end - root, c[14], start + gauge.displacement, gauge.direction, gauge.edge
-        )
-        return ca.SX(gauge.scale * reading)
+        reading = type(self).touch(root, end - root, c[14], start + shift, plunger, edge)
+        return ca.SX(scale * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
         """Points of contact in K postures.
@@ -354,14 +352,8 @@ class LegIndicator:
         if self.rod is None:
             share = ((start - roots) @ axis) / ((ends - roots) @ axis)
             points, tip = roots + share[:, None] * (ends - roots), None
-            length = robot.legs[self.leg].length / MM
-            problems = [
-                ""
-                if 0.0 <= t <= 1.0
-                else f"the gauge would touch at {t * length:.1f} mm from the root; the leg reaches "
-                f"from 0 to {length:.1f} mm"
-                for t in share.tolist()
-            ]
+            length = robot.legs[self.leg].length
+            problems = [_end_problem("leg", t * length, length) for t in share.tolist()]
         else:
             tip = TouchingTip(
                 self.tip.radius, None if self.tip.form == "ball" else side, self.tip.width
@@ -394,7 +386,7 @@ class LegIndicator:
         along = ends - roots
         lengths = np.linalg.norm(along, axis=1)
         units = along / lengths[:, None]
-        touch = _touch_function(self.tip.form)
+        touch = _touch_function(type(self).touch)
         h = np.asarray(touch(roots.T, along.T, radius, start, direction, side))[0]
         across = np.cross(units, direction)
         lateral = np.einsum("ki,ki->k", across, start - roots) / np.linalg.norm(across, axis=1)
@@ -438,12 +430,7 @@ class LegIndicator:
                 f"the blade would slide off: it would touch {off_middle / MM:.1f} mm from its "
                 f"middle, and is {self.tip.width / MM:.1f} mm wide"
             )
-        if not 0.0 <= distance <= length:
-            return (
-                f"the gauge would touch at {distance / MM:.1f} mm from the root; the rod reaches "
-                f"from 0 to {length / MM:.1f} mm"
-            )
-        return ""
+        return _end_problem("rod", distance, length)
 
     def plane(self, robot: Robot, *, where: str = "") -> tuple[float, bool]:
         """Plane of the section across the leg, a · p = c or a · p = c + a · root.
@@ -503,6 +490,22 @@ class BallIndicator(LegIndicator):
         return replace(self, beside=beside)
 
 
+def _end_problem(part: str, distance: float, length: float) -> str:
+    """Reason why a gauge cannot touch beyond an end of a leg or rod; empty between its ends.
+
+    Args:
+        part: Leg or rod.
+        distance: Distance of the contact from the root, [m].
+        length: Length of the part, [m].
+    """
+    if 0.0 <= distance <= length:
+        return ""
+    return (
+        f"the gauge would touch at {distance / MM:.1f} mm from the root; the {part} reaches from 0 "
+        f"to {length / MM:.1f} mm"
+    )
+
+
 def _coordinate_plane(leg: Leg, value: float, where: str) -> float:
     """Coordinate along the leg's axis of a plane at a world coordinate, [m]."""
     axis = int(np.abs(leg.axis).argmax())
@@ -528,8 +531,7 @@ def _place(constants: Matrix, at_zero: Sequence[Matrix]) -> tuple[Matrix, Matrix
 
 
 @cache
-def _touch_function(form: str) -> ca.Function:
+def _touch_function(touch: Callable[..., ca.SX]) -> ca.Function:
     """Reading of a form of tip as a function of rods, one per column."""
     symbols = [ca.SX.sym("s", n) for n in (3, 3, 1, 3, 3, 3)]
-    touch = touch_by_ball if form == "ball" else touch_by_blade
     return ca.Function("touching", symbols, [touch(*symbols)])

@@ -144,20 +144,6 @@ EXACT = Mounting(0.0, 0.0, 0.0, 0.0)
 """Mounting without errors: the gauge of the paper."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MountedGauge:
-    """Gauge with mounting errors, as expressions."""
-
-    direction: ca.SX
-    """Unit vector of the plunger, shape (3,)."""
-    edge: ca.SX
-    """Unit vector of a blade across leg and plunger, shape (3,)."""
-    displacement: ca.SX
-    """Displacement of the tip from its nominal position, shape (3,), [m]."""
-    scale: ca.SX
-    """Ratio of indicated to actual displacement, [1]."""
-
-
 def mount(
     parameters: Sequence[NuisanceParameter],
     values: ca.SX,
@@ -165,8 +151,8 @@ def mount(
     direction: ca.SX,
     side: ca.SX,
     axis: ca.SX,
-) -> MountedGauge:
-    """Gauge with mounting errors.
+) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Gauge with mounting errors, as expressions.
 
     Args:
         parameters: Nuisance parameters of the mounting.
@@ -174,16 +160,18 @@ def mount(
         direction: Nominal unit vector of the plunger, shape (3,).
         side: Unit vector across leg and plunger, shape (3,).
         axis: Unit vector of the leg, from root to tip, shape (3,).
+
+    Returns:
+        Displacement of the tip from its nominal position, shape (3,), [m]; unit vectors of the
+        plunger and of a blade across leg and plunger, shape (3,); and the ratio of indicated to
+        actual displacement, [1].
     """
     error = {p.name: values[i] for i, p in enumerate(parameters)}
     roll = ca.SX(error.get("roll", 0.0) + error.get("square", 0.0))
     pitched = rotate(direction, side, -error.get("pitch", ca.SX(0.0)))
-    return MountedGauge(
-        direction=rotate(pitched, axis, roll),
-        edge=rotate(side, axis, roll),
-        displacement=error.get("section", 0.0) * axis + error.get("lateral", 0.0) * side,
-        scale=1.0 + error.get("scale", ca.SX(0.0)),
-    )
+    displacement = error.get("section", 0.0) * axis + error.get("lateral", 0.0) * side
+    plunger, edge = (rotate(vector, axis, roll) for vector in (pitched, side))
+    return displacement, plunger, edge, 1.0 + error.get("scale", ca.SX(0.0))
 
 
 def rotate(vector: ca.SX, axis: ca.SX, angle: ca.SX) -> ca.SX:

@@ -23,7 +23,7 @@ from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import with_effects
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number, describe_missing
-from orthocal.io.fields import CLOSED, read_only
+from orthocal.io.fields import FileRecord, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
@@ -39,13 +39,11 @@ PostureForm = Literal["tcp", "joints"]
 
 
 @dataclass(frozen=True, slots=True)
-class Purpose:
+class Purpose(FileRecord):
     """Model and free errors that a session states for `calibrate`.
 
     Of joined sessions, those that state nothing follow the others.
     """
-
-    __pydantic_config__ = CLOSED
 
     model: str | None = None
     """Model of the robot's YAML."""
@@ -149,7 +147,7 @@ CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
 
 
 @dataclass(frozen=True, slots=True)
-class Conditions:
+class Conditions(FileRecord):
     """Stated conditions of a reading.
 
     Args:
@@ -158,8 +156,6 @@ class Conditions:
         temperature: Temperature of the machine, [°C].
         time: Time of the reading, with or without time zone.
     """
-
-    __pydantic_config__ = CLOSED
 
     approach: Annotated[str, Field(pattern="^[pnu]+$")] | None = None
     temperature: Annotated[Number | None, Field(alias="temperature_C")] = None

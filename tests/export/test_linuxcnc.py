@@ -39,7 +39,7 @@ from orthocal import (
 )
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import offsets_to_enter
-from orthocal.calibration.machine import Machine
+from orthocal.calibration.calibration import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
 from orthocal.export.linuxcnc.drive_compensation import find_active_compensation, find_compensation

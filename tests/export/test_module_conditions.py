@@ -28,7 +28,7 @@ from orthocal import (
     load_robot,
     simulate_session,
 )
-from orthocal.calibration.machine import Machine
+from orthocal.calibration.calibration import Machine
 from orthocal.effects.compliance import GRAVITY
 from orthocal.export.linuxcnc import approximation as approximating
 from orthocal.export.linuxcnc.approximation import approximate, check_points

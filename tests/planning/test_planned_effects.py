@@ -147,7 +147,7 @@ def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
 
 def test_positions_lie_at_fractions_of_the_lead(orthoglide):
     """At multiples of 5 mm the periodic error of a screw with a lead of 5 mm is constant."""
-    declared = replace(orthoglide.declared, effects={"screw": {"lead_mm": 5.0}})
+    declared = orthoglide.declared.model_copy(update={"effects": {"screw": {"lead_mm": 5.0}}})
     screw = with_effects(replace(orthoglide, declared=declared), ["screw"])
     for robot, least in ((orthoglide, 1), (screw, 4)):
         session = list_candidates(robot, replace(FEW, along=7))
@@ -165,7 +165,8 @@ def test_a_plan_determines_both_parts_of_a_periodic_error(orthoglide):
     """
     lead, std = 5.0 * MM, 10.0 * UM
     keys = {"screw": {"lead_mm": lead / MM, "periodic_tolerance_mm": 2.0 * std / MM}}
-    robot = replace(orthoglide, declared=replace(orthoglide.declared, effects=keys))
+    declared = orthoglide.declared.model_copy(update={"effects": keys})
+    robot = replace(orthoglide, declared=declared)
     fine = Gauge(sigma=0.5 * UM, resolution=1.0 * UM, range=(-5.0 * MM, 5.0 * MM))
     equipment = Equipment(gauge=fine, sections=(0.5,), across=0.0)
     with uncompared():

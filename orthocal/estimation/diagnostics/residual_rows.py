@@ -10,15 +10,13 @@ from typing import Annotated
 from pydantic import Field
 
 from orthocal.io.documents import Count, Number
-from orthocal.io.fields import CLOSED, NumberOrNaN
+from orthocal.io.fields import FileRecord, NumberOrNaN
 from orthocal.session.session import Conditions, describe_postures, known_approach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ResidualRow:
+class ResidualRow(FileRecord):
     """Row of a session's readings: measured = nominal + deviation = predicted + residual."""
-
-    __pydantic_config__ = CLOSED
 
     setup: str
     posture: str

@@ -19,7 +19,7 @@ import numpy as np
 from orthocal.arrays import Array, Mask
 from orthocal.estimation.fit import Fit
 from orthocal.io.documents import Number
-from orthocal.io.fields import CLOSED, Many, Matrix, Sizes, read_only
+from orthocal.io.fields import FileRecord, Many, Matrix, Sizes, read_only
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
@@ -29,10 +29,8 @@ FULL_MODEL = "full"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UnmodelledEffect:
+class UnmodelledEffect(FileRecord):
     """Unmodelled errors and their effect on an estimate."""
-
-    __pydantic_config__ = CLOSED
 
     names: Many[str]
     """Names of the unmodelled errors."""
@@ -74,7 +72,7 @@ class UnmodelledErrors:
     eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def machine_errors(robot: Robot) -> tuple[str, ...]:
     """Names of all errors of a machine, in the robot's order.
 

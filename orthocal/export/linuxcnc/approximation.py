@@ -189,6 +189,8 @@ class _State:
     drives: Array | None
     """Drive coordinates at the nodes of the fit, shape (n_nodes, n_drives), [m, rad]; None at a
     temperature that is not fitted."""
+    checks: Array
+    """Checked points, shape (n_checks, n), [m]."""
     expected: Array
     """Drive coordinates at the checked points at the reference temperature, shape (n_checks,
     n_drives), [m, rad]."""
@@ -197,22 +199,16 @@ class _State:
     (n_checks, n_passive), [m, rad]."""
 
     def error(
-        self,
-        checks: Array,
-        inverse: CorrectedInverse,
-        *,
-        at_reference: bool = False,
-        rows: slice = ALL_ROWS,
+        self, inverse: CorrectedInverse, *, at_reference: bool = False, rows: slice = ALL_ROWS
     ) -> float:
         """Largest error at the checked points, [m]; infinite if a point is out of reach.
 
         Args:
-            checks: Checked points, shape (n_checks, n), [m].
             inverse: The approximation.
             at_reference: Whether the approximation assumes the reference temperature.
             rows: Selection of the checked points.
         """
-        points = checks[rows]
+        points = self.checks[rows]
         drives = inverse(points, None if at_reference else self.temperature)
         tip_error = _tip_error(self.tip, points, drives, start=self.passive[rows])
         return math.inf if tip_error is None else tip_error
@@ -249,17 +245,10 @@ def approximate(
     middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     n = middle.size
     max_degree = MAX_DEGREE[n]
-    nodes = grid_points(chebyshev_line(max_degree + EXTRA_NODES), n)
+    nodes = grid_points(*[chebyshev_line(max_degree + EXTRA_NODES)] * n)
     checks = middle + half * check_points(n)
     with _reached(box):
-        states = _reach_states(
-            calibration,
-            tool,
-            payload,
-            corners=middle + half * corners(n),
-            nodes=middle + half * nodes,
-            checks=checks,
-        )
+        states = _reach_states(calibration, tool, payload, middle + half * nodes, checks)
     form = find_nominal_form(robot, middle, half)
     corrections = np.asarray(states[0].drives) - form(middle + half * nodes)
     change, refused = _find_change(states), list[CorrectedInverse]()
@@ -267,12 +256,12 @@ def approximate(
         fit = PolynomialFit(nodes, total_degree(n, degree))
         thermal = change and ThermalChange(*change[0], fit(middle, half, change[1]))
         inverse = CorrectedInverse(form, fit(middle, half, corrections), thermal)
-        if _largest_error(states, checks, inverse, rows=slice(-QUICK_CHECKS, None)) <= within:
-            error = _largest_error(states, checks, inverse)
+        if _largest_error(states, inverse, rows=slice(-QUICK_CHECKS, None)) <= within:
+            error = _largest_error(states, inverse)
             if error <= within:
-                return _assess(calibration, states, inverse, checks, error, payload)
+                return _assess(calibration, states, inverse, error, payload)
         refused.append(inverse)
-    best = min(_largest_error(states, checks, inverse) for inverse in refused)
+    best = min(_largest_error(states, inverse) for inverse in refused)
     raise ExportError(
         f"no polynomial of a degree up to {max_degree} keeps the tool within {within / UM:g} µm "
         f"over {describe_box(box)}; the smallest error is {rounded_up(best / UM)} µm"
@@ -280,18 +269,16 @@ def approximate(
 
 
 def _largest_error(
-    states: Sequence[_State], checks: Array, inverse: CorrectedInverse, *, rows: slice = ALL_ROWS
+    states: Sequence[_State], inverse: CorrectedInverse, *, rows: slice = ALL_ROWS
 ) -> float:
     """Largest error in all states at the checked points, times ERROR_MARGIN, [m]."""
-    return ERROR_MARGIN * max(state.error(checks, inverse, rows=rows) for state in states)
+    return ERROR_MARGIN * max(state.error(inverse, rows=rows) for state in states)
 
 
 def _reach_states(
     calibration: Calibration,
     tool: ArrayLike,
     payload: float | None,
-    *,
-    corners: Array,
     nodes: Array,
     checks: Array,
 ) -> list[_State]:
@@ -301,9 +288,8 @@ def _reach_states(
         calibration: The calibration.
         tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
         payload: Mass on the tool, [kg].
-        corners: Points that are reached first, to fail fast, shape (2^n, n), [m].
         nodes: Points of the fit, shape (n_nodes, n), [m].
-        checks: Points at which errors are evaluated, shape (n_checks, n), [m].
+        checks: Points at which errors are evaluated, the corners last, shape (n_checks, n), [m].
 
     Raises:
         ClosureError: If a point is out of reach.
@@ -316,13 +302,13 @@ def _reach_states(
         conditions = UseConditions(temperature=temperature, payload=payload)
         tip, drives = ToolTip(calibration, tool, errors=errors, conditions=conditions), None
         if not states:
-            tip.reach(corners)
+            tip.reach(checks[-(2 ** checks.shape[1]) :])  # the corners, to fail fast
         if is_fitted:
             drives, passive = tip.reach(nodes, start=start)
             start = np.hstack([drives, passive])
             require_within_travel(robot, drives, ["a point"] * len(drives))
         at_checks = tip.reach(checks) if at_checks is None else at_checks
-        states.append(_State(temperature, tip, drives, *at_checks))
+        states.append(_State(temperature, tip, drives, checks, *at_checks))
     return states
 
 
@@ -367,7 +353,6 @@ def _assess(
     calibration: Calibration,
     states: Sequence[_State],
     inverse: CorrectedInverse,
-    checks: Array,
     error: float,
     payload: float | None,
 ) -> Approximation:
@@ -379,18 +364,18 @@ def _assess(
         conditions = UseConditions(temperature=first.temperature, payload=payload + HEAVIER_PAYLOAD)
         errors = without_periodic_errors(calibration.robot, calibration.errors)
         tip = ToolTip(calibration, first.tip.tool, errors=errors, conditions=conditions)
-        heavier = replace(first, tip=tip).error(checks, inverse)
+        heavier = replace(first, tip=tip).error(inverse)
     return Approximation(
         inverse=inverse,
         tool=first.tip.tool,
         coordinates=tuple(first.tip.coordinates),
         achieved=error,
-        checked=len(checks),
-        nominal_error=_nominal_error(first, inverse.nominal, checks, calibration.active_offsets),
+        checked=len(first.checks),
+        nominal_error=_nominal_error(first, inverse.nominal, calibration.active_offsets),
         error_beyond=_error_beyond(first.tip, inverse, calibration),
         error_of_longer_tool=_error_of_longer_tool(first.tip, first.expected, first.passive),
         error_without_thermometer=max(
-            (s.error(checks, inverse, at_reference=True) for s in states[1:]), default=None
+            (s.error(inverse, at_reference=True) for s in states[1:]), default=None
         ),
         payload=payload,
         error_of_heavier_payload=heavier,
@@ -408,12 +393,7 @@ def check_points(n: int, *, count: int = CHECKS, seed: int = 1) -> Array:
     surface[np.arange(count), face] = generator.choice([-1.0, 1.0], count)
     edges = generator.random((count, n)) < 0.3
     surface[edges] = generator.choice([-1.0, 1.0], int(edges.sum()))
-    return np.concatenate([inside, surface, corners(n)])
-
-
-def corners(n: int) -> Array:
-    """Corners of a cube of ±1, shape (2^n, n)."""
-    return grid_points(np.array([-1.0, 1.0]), n)
+    return np.concatenate([inside, surface, grid_points(*[[-1.0, 1.0]] * n)])
 
 
 def _find_box(calibration: Calibration, half_side: float | None) -> Array:
@@ -451,11 +431,11 @@ def _tip_error(
     return float(np.linalg.norm(error, axis=1).max())
 
 
-def _nominal_error(state: _State, form: NominalForm, checks: Array, offsets: Array) -> float | None:
+def _nominal_error(state: _State, form: NominalForm, offsets: Array) -> float | None:
     """Largest error with nominal kinematics and offsets, [m]; None without a closed form."""
     if isinstance(form, Tangent):
         return None
-    return _tip_error(state.tip, checks, form(checks) - offsets, start=state.passive)
+    return _tip_error(state.tip, state.checks, form(state.checks) - offsets, start=state.passive)
 
 
 def _error_beyond(

@@ -25,7 +25,6 @@ from orthocal.export.linuxcnc.approximation import (
 from orthocal.export.linuxcnc.drive_compensation import find_periodic_errors
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
-from orthocal.robot.model import Drive
 from orthocal.text import comment_safe
 from orthocal.units import MM, UM
 
@@ -69,7 +68,7 @@ def write_core(
         "half": braced(polynomial.half / MM),
         "exponent": braced(polynomial.exponents),
         "coefficient": braced(polynomial.coefficients * to_joints[:, None]),
-        "nominal": _write_nominal(inverse.nominal, drives, calibration.active_offsets),
+        "nominal": _write_nominal(inverse.nominal, calibration),
         **screws,
         **thermal,
     }
@@ -103,10 +102,9 @@ def _write_thermal(change: ThermalChange | None, to_joints: Array) -> dict[str, 
 
 def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[str, object]:
     """Values of the template: periodic errors of the screws, and trims of the joints at home."""
-    drives, active = calibration.robot.drives, calibration.active_offsets
+    drives = calibration.robot.drives
     units = np.array([d.joint_size for d in drives])
     directions = np.array([d.direction for d in drives])
-    at_zero = np.array([d.to_joint(v) for d, v in zip(drives, active, strict=True)])
     home = [h.compensation.trim_at_home(h.old) - h.was.trim_at_home(h.old) for h in homes]
     periodic = find_periodic_errors(calibration.robot, calibration.errors)
     sine, cosine = (
@@ -121,22 +119,25 @@ def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[
         "sine": braced(sine / units),
         "cosine": braced(cosine / units),
         "screw_direction": braced(directions),
-        "screw_zero": braced(at_zero / units),
+        "screw_zero": braced(_to_joints(calibration, np.zeros(len(drives)))),
     }
 
 
-def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) -> str:
+def _to_joints(calibration: Calibration, coordinates: Array) -> Array:
+    """Joint coordinates, [mm or degrees], of drive coordinates with the active offsets."""
+    values = (coordinates + calibration.active_offsets).tolist()
+    drives = zip(calibration.robot.drives, values, strict=True)
+    return np.array([d.to_joint(v) / d.joint_size for d, v in drives])
+
+
+def _write_nominal(form: NominalForm, calibration: Calibration) -> str:
     """C source of the nominal form in joints, with the active offsets of the controller."""
+    drives = calibration.robot.drives
     directions = np.array([d.direction for d in drives])
-    units = np.array([d.joint_size for d in drives])
-
-    def joints(coordinates: Array) -> Array:
-        values = zip(drives, coordinates + active, strict=True)
-        return np.asarray(np.array([d.to_joint(v) for d, v in values]) / units)
-
     if isinstance(form, Tangent):
+        units = np.array([d.joint_size for d in drives])
         values = {
-            "at_middle": braced(joints(form.values)),
+            "at_middle": braced(_to_joints(calibration, form.values)),
             "jacobian": braced(form.jacobian * (directions * MM / units)[:, None]),
         }
         return fill_template("tangent.c", values)
@@ -146,7 +147,7 @@ def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) 
         "length": braced(form.lengths / MM),
         "sign": braced(form.signs),
         "direction": braced(directions),
-        "at_zero": braced(joints(np.zeros(len(drives)))),
+        "at_zero": braced(_to_joints(calibration, np.zeros(len(drives)))),
     }
     return fill_template("slides.c", values)
 

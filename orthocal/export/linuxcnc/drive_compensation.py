@@ -140,30 +140,23 @@ class JointCompensation(JointTrim):
 
 
 def find_active_compensation(
-    calibration: Calibration, latched: Sequence[int] | None
-) -> tuple[JointCompensation, ...]:
-    """Compensation that was active during the measurement, in the order of the drives.
-
-    Raises:
-        ParameterError: If the numbers of directions and drives differ.
-    """
-    return with_latching(calibration.robot, calibration.session.compensation, latched)
-
-
-def with_latching(
-    robot: Robot, trims: Sequence[JointTrim], latched: Sequence[int] | None
+    calibration: Calibration,
+    latched: Sequence[int] | None,
+    trims: Sequence[JointTrim] | None = None,
 ) -> tuple[JointCompensation, ...]:
     """Compensation of joints whose homing latches in some direction, in the order of the drives.
 
     Args:
-        robot: The robot.
-        trims: Compensation of the joints; empty for none.
+        calibration: The calibration.
         latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        trims: Compensation of the joints, empty for none; by default the one that was active during
+            the measurement.
 
     Raises:
         ParameterError: If the numbers of directions and drives differ.
     """
-    drives = robot.drives
+    drives, stated = calibration.robot.drives, calibration.session.compensation
+    trims = (stated if trims is None else trims) or (JointTrim(),) * len(drives)
     signs = (1,) * len(drives) if latched is None else tuple(latched)
     if len(signs) != len(drives):
         names = ", ".join(d.name for d in drives)
@@ -174,7 +167,7 @@ def with_latching(
         )
     return tuple(
         JointCompensation(trim.backlash, trim.table, trim.home, latched=sign)
-        for trim, sign in zip(trims or (JointTrim(),) * len(signs), signs, strict=True)
+        for trim, sign in zip(trims, signs, strict=True)
     )
 
 

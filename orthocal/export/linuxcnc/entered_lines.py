@@ -20,7 +20,6 @@ from orthocal.errors import ExportError
 from orthocal.export.linuxcnc.drive_compensation import (
     compensate_with_offsets,
     find_active_compensation,
-    with_latching,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.robot.model import Drive, Robot
@@ -171,7 +170,7 @@ def expected_homes(
     old = home_positions(before)
     if old is None:
         return None
-    now = with_latching(calibration.robot, stated, latched)
+    now = find_active_compensation(calibration, latched, stated)
     changes = [[h.change, h.opposite] for h in find_homes(calibration, now, before, old)]
     homes = np.array(old)[:, None] + np.array(changes)
     same = np.ptp(homes, axis=1).max(initial=0.0) <= SAME_OFFSET

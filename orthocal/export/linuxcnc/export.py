@@ -126,33 +126,35 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     options = replace(options, home_offsets=options.home_offsets or home_positions(before))
     stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
-    if not module:
+    if module:
+        compensation = find_compensation(calibration, options.latched)
+        compensation = compensate_with_module(calibration, compensation, before)
+        compensation = round_backlash(compensation, before)
+        if not compensates_alike(compensation, before):
+            _require_home_offsets(options, before)
+    else:
         _refuse_module_options(options)
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
         compensation = compensate_with_offsets(calibration, options.latched)
         _require_change(calibration, compensation, before)
         _require_home_offsets(options, [*before, *compensation])
-        homes = find_homes(
-            calibration, compensation, before, options.home_offsets, options.joint_limits
-        )
-        return {
-            "README.md": write_home_page(calibration, homes, stated=stated),
-            "joints.ini": write_home_lines(calibration, homes, stated=stated),
-            **_write_tables(calibration, compensation, before),
-        }
-    compensation = find_compensation(calibration, options.latched)
-    compensation = compensate_with_module(calibration, compensation, before)
-    compensation = round_backlash(compensation, before)
-    if not compensates_alike(compensation, before):
-        _require_home_offsets(options, before)
     homes = find_homes(
         calibration, compensation, before, options.home_offsets, options.joint_limits
     )
+    tables = {
+        h.compensation.file_name(i): format_table(h.compensation, h.drive)
+        for i, h in enumerate(homes)
+        if h.compensation.table is not None and h.compensation.table is not h.was.table
+    }
+    if not module:
+        page = write_home_page(calibration, homes, stated=stated)
+        lines = write_home_lines(calibration, homes, stated=stated)
+        return {"README.md": page, "joints.ini": lines, **tables}
     approximation = approximate(
         calibration,
         within=DEFAULT_TOLERANCE if options.within is None else options.within,
-        tool=(0.0, 0.0, 0.0) if options.tool is None else options.tool,
+        tool=options.tool or (0.0, 0.0, 0.0),
         half_side=options.half_side,
         payload=options.payload,
     )
@@ -161,21 +163,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         "kinematics.ini": write_module_lines(approximation, homes),
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
-        **_write_tables(calibration, compensation, before),
-    }
-
-
-def _write_tables(
-    calibration: Calibration,
-    compensation: Sequence[JointCompensation],
-    before: Sequence[JointCompensation],
-) -> dict[str, str]:
-    """Texts of new tables of joints by file name."""
-    joints = zip(calibration.robot.drives, compensation, before, strict=True)
-    return {
-        joint.file_name(i): format_table(joint, drive)
-        for i, (drive, joint, old) in enumerate(joints)
-        if joint.table is not None and joint.table is not old.table
+        **tables,
     }
 
 

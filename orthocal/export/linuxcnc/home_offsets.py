@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.assessment.wording import counted
 from orthocal.calibration.calibration import Calibration
@@ -125,10 +124,7 @@ def find_homes(
         limits = None if stated_limits is None else stated_limits[i]
         if active is not None:
             travel = np.array(d.joint_limits) + d.direction * active[i]
-            common = _intersect(travel, limits, home)
-            if limits is not None and common[0] >= common[1]:
-                raise _no_common_position(f"JOINT_{i}", d, limits, travel)
-            limits = common
+            limits = _intersect(f"JOINT_{i}", d, travel.tolist(), limits, home)
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
         home_changes = [0.0, 0.0]
         for k, opposite in enumerate((False, True)):
@@ -168,31 +164,31 @@ def _require_one_each(
         )
 
 
-def _no_common_position(
-    joint: str, drive: Drive, stated: tuple[float, float], travel: Array
-) -> ParameterError:
-    """Error for stated limits and a travel, shape (2,), without a common position, [unit]."""
-    limits, possible = (
-        f"{drive.show(low)} to {drive.show(high)}" for low, high in (stated, travel)
-    )
-    return ParameterError(
-        f"{joint} ({drive.name}) has soft limits {limits}; the travel of the drive is {possible}: "
-        "expected limits within the travel",
-        where="--ini",
-    )
-
-
 def _intersect(
-    travel: Array, stated: tuple[float, float] | None, home: float | None
+    joint: str,
+    drive: Drive,
+    travel: Sequence[float],
+    stated: tuple[float, float] | None,
+    home: float | None,
 ) -> tuple[float, float]:
-    """Limits that a joint's travel, shape (2,), and its stated limits have in common, [unit].
+    """Limits that a joint's travel and its stated limits have in common, [unit].
 
     A stated limit at HOME_OFFSET counts beyond the travel: an earlier export has widened it.
+
+    Raises:
+        ParameterError: If stated limits and travel exclude each other.
     """
     low, high = stated or (-np.inf, np.inf)
     at_low, at_high = (
         home is not None and abs(home - limit) < SAME_POSITION for limit in (low, high)
     )
-    lowest = low if at_low else max(float(travel[0]), low)
-    highest = high if at_high else min(float(travel[1]), high)
+    lowest = low if at_low else max(travel[0], low)
+    highest = high if at_high else min(travel[1], high)
+    if stated is not None and lowest >= highest:
+        limits, possible = (f"{drive.show(a)} to {drive.show(b)}" for a, b in (stated, travel))
+        raise ParameterError(
+            f"{joint} ({drive.name}) has soft limits {limits}; the travel of the drive is "
+            f"{possible}: expected limits within the travel",
+            where="--ini",
+        )
     return lowest, highest

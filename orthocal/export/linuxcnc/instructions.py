@@ -185,21 +185,18 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
         module: Whether a module displaces the joints, instead of HOME_OFFSET.
     """
     paragraphs = []
-    with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
-    if with_backlash and not any(h.compensation_changes for h in homes):
-        listed = ", ".join(
-            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.drive.joint_unit}"
-            for i, h in with_backlash
-        )
+    changes = any(h.compensation_changes for h in homes)
+    listed = ", ".join(
+        f"JOINT_{i} {h.show(h.compensation.backlash)} {h.drive.joint_unit}"
+        + f" (latched in {'+' if h.compensation.latched > 0 else '-'} direction)" * changes
+        for i, h in enumerate(homes)
+        if h.compensation.backlash
+    )
+    if listed and not changes:
         paragraphs.append(
             f"**Backlash:** {listed}, as during the measurement. Keep these lines BACKLASH."
         )
-    elif with_backlash:
-        listed = ", ".join(
-            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.drive.joint_unit} (latched in "
-            f"{'+' if h.compensation.latched > 0 else '-'} direction)"
-            for i, h in with_backlash
-        )
+    elif listed:
         paragraphs.append(
             f"**Backlash:** {listed}.\nLinuxCNC compensates it by the lines BACKLASH, or by the "
             f"columns of COMP_FILE. {_IN_MODULE if module else _IN_HOME_OFFSET}. The numbers\n"

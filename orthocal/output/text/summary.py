@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from orthocal.planning.plan import MeasuringPlan
     from orthocal.study.runner import StudyTable
 
-    Result = Calibration | Validation | Comparison | MeasuringPlan | StudyTable
+    Result: TypeAlias = Calibration | Validation | Comparison | MeasuringPlan | StudyTable
 
 
 def summarize(
