@@ -1,8 +1,8 @@
-"""Types of arrays, and a cache of arrays."""
+"""Types of arrays, three numbers, and a cache of arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -11,6 +11,14 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.int64]
 Mask: TypeAlias = NDArray[np.bool_]
+
+Triple = tuple[float, float, float]
+
+
+def triple(values: Sequence[float] | Array, unit: float = 1.0) -> Triple:
+    """Three numbers in a unit, in SI."""
+    x, y, z = (float(v) * unit + 0.0 for v in values)
+    return x, y, z
 
 
 class ArrayCache:

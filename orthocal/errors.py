@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from orthocal.text import printable
 
@@ -40,6 +41,21 @@ class OrthocalError(Exception):
     def __reduce__(self) -> tuple[object, ...]:
         # by its attributes: another process does not know the arguments of __init__
         return _restore, (type(self), self.args, self.__dict__)
+
+
+@contextmanager
+def errors_at(where: str) -> Iterator[None]:
+    """Add a place to the errors of the block that state none.
+
+    Args:
+        where: File and line, or file and key.
+    """
+    try:
+        yield
+    except OrthocalError as e:
+        if e.where is None:
+            OrthocalError.__init__(e, e.problem, where=where, missing=e.missing)
+        raise
 
 
 def _restore(

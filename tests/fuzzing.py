@@ -569,8 +569,8 @@ def use_program(folder: Path, rng: random.Random, deep: bool) -> None:
     """Correct a program; what comes out has lines that are read, and is a program of G0 and G1."""
 
     def correct(lines: Any, by: Any) -> str:
-        interpreter = Interpreter("p", axes=(0, 1), offsets={"G54": (0.0, 0.0, 0.0)})
-        return "".join(ProgramCorrector(interpreter, by, within=1e-4).run(lines))
+        interpreter = Interpreter(axes=(0, 1), offsets={"G54": (0.0, 0.0, 0.0)})
+        return "".join(ProgramCorrector(interpreter, by, file="p.ngc", within=1e-4).run(lines))
 
     by = correction_of(folder / "calibration.json") if deep else Shifted()
     text = correct(_lines(folder / "part.ngc", "part.ngc"), by)

@@ -54,13 +54,12 @@ from orthocal.estimation.fit import Fit
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
-from orthocal.measurement.files.session_keys import OFFSET_KEYS, keys_for_unit
+from orthocal.measurement.files.session_keys import drive_value_keys
 from orthocal.measurement.joining import (
     Given,
     gather_sessions,
     join_sessions,
     list_members,
-    on_one_printer,
     require_same_tolerances,
 )
 from orthocal.runtime.threads import one_thread
@@ -311,7 +310,7 @@ def _apply_stated(
     robot, settings = calibration.robot.with_tolerances(tolerances), calibration.session.firmware
     placed = sessions
     if settings is not None:
-        placed = on_one_printer(sessions, calibration.robot, settings.homed)
+        placed = [s.on_printer(calibration.robot, settings.homed) for s in sessions]
     for session in placed:
         require_calibrated_robot(calibration, session)
     restated = [
@@ -424,7 +423,7 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
             continue
         if abs(active - entry.enter) > max(ALLOWED_STDS * entry.std_scatter, ROUNDING):
             factor, unit = entry.edge_factor, entry.edge_unit
-            keys = " or ".join(keys_for_unit(OFFSET_KEYS, entry.unit))
+            keys = " or ".join(drive_value_keys("offsets", entry.unit))
             where = f"{session.path or 'session'}: controller.{keys}"
             differences.append(
                 f"{entry.drive} has {active * factor:g} {unit} instead of "

@@ -222,11 +222,8 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
             require_adjustment(robot, name, where=where, error=CalibrationFileError)
     for i, row in enumerate(record.residuals):
         if row.conditions is not None:
-            where = f"{file}: residuals[{i}].conditions"
-            with _errors_at(where):
-                check_conditions(
-                    row.conditions, robot, two_postures=row.minus is not None, where=where
-                )
+            with _errors_at(f"{file}: residuals[{i}].conditions"):
+                check_conditions(row.conditions, robot, two_postures=row.minus is not None)
 
 
 @contextmanager

@@ -20,8 +20,8 @@ from orthocal.io.fields import FileRecord, Many, Matrix, SizeOrInf, SizeOrNaN, V
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.robot.files import MOST_FILES, is_inner_path
-from orthocal.sensors.protocol import GaugeZero, Sensor
-from orthocal.sensors.registry import RECORDED
+from orthocal.sensors.protocol import GaugeZero
+from orthocal.sensors.registry import RecordedSensor
 from orthocal.session.session import Posture, Purpose
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.statistics.noise import Noise
@@ -226,7 +226,7 @@ class SetupRecord(FileRecord):
     """A setup of the session."""
 
     name: str
-    sensor: Annotated[Sensor, RECORDED, Field(alias="reads")]
+    sensor: Annotated[RecordedSensor, Field(alias="reads")]
     """Sensor of the setup."""
     gauge: str
     """Name of its gauge."""

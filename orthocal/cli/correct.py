@@ -207,7 +207,6 @@ class _Correction:
             aligned_over=_find_workspace(result),
         )
         self.interpreter = Interpreter(
-            file,
             axes=self.field.axes,
             offsets=controller.work_offsets,
             origin=result.session.controller_origin,
@@ -221,7 +220,12 @@ class _Correction:
         sides = ApproachSides(result, values, lags) if by_program else None
         self.backlash = _describe_backlash(result, lags, by_program=by_program)
         self.corrector = ProgramCorrector(
-            self.interpreter, self.field, within=self.tolerance, region=region, sides=sides
+            self.interpreter,
+            self.field,
+            file=file,
+            within=self.tolerance,
+            region=region,
+            sides=sides,
         )
         self.for_controller = _describe_controller(result, values, active=active)
 

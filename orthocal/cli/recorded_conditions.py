@@ -6,13 +6,12 @@ import sys
 from datetime import datetime
 from typing import TypeGuard
 
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.tables.numerals import plain_minus
 from orthocal.kinematics.conditions import APPROACH, find_approach_problem
 from orthocal.measurement.files.readings_checks import parse_temperature
-from orthocal.measurement.recorded_rows import RecordedReading
+from orthocal.measurement.recorded_rows import NextConditions, RecordedReading
 from orthocal.measurement.recording import Recording
-from orthocal.measurement.recording_journal import NextConditions
 from orthocal.observation.conditions import needed_conditions
 from orthocal.session.session import Conditions
 
@@ -118,7 +117,8 @@ class RecordedConditions:
     def _read_temperature(self, text: str) -> float:
         """Typed temperature, [°C]; refuse one that no workshop has."""
         number, before = plain_minus(text).replace(",", "."), self.temperature
-        temperature = parse_temperature(number, "the temperature")
+        with errors_at("the temperature"):
+            temperature = parse_temperature(number)
         change = abs(temperature - before) if _is_usual(before) else 0.0
         self.is_unusual = not _is_usual(temperature) or change > USUAL_CHANGE
         return temperature

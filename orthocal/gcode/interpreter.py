@@ -187,13 +187,12 @@ class Tools:
         self._loaded: float | None = None
         self._changed = False
 
-    def read(self, number: float | None, *, load: bool, where: str) -> None:
+    def read(self, number: float | None, *, load: bool) -> None:
         """Apply the T and M6 words of a line.
 
         Args:
             number: Number of the T word; None if there is none.
             load: Whether the line contains M6.
-            where: File and line, for messages.
 
         Raises:
             GcodeError: If a second tool is loaded and must be refused.
@@ -209,8 +208,7 @@ class Tools:
                 raise GcodeError(
                     f"found {second} after motions of {self.used[-1]}, and --tool states one tip; "
                     "expected one tool: split the program by tools, and correct each part with "
-                    "its own --tool",
-                    where=where,
+                    "its own --tool"
                 )
 
     def move(self, *, feed: bool) -> None:
@@ -236,8 +234,9 @@ def _subtract(point: Vector, origin: Vector) -> Vector:
 class Interpreter:
     """Interpreter that reads a program line by line.
 
+    Its errors do not state a place.
+
     Args:
-        file: Name of the program, for messages.
         axes: Indices of the axes that the drives command.
         offsets: Zeros of the work coordinate systems in machine coordinates, [m], by name. Without
             G54 the program starts in machine coordinates.
@@ -248,7 +247,6 @@ class Interpreter:
 
     def __init__(
         self,
-        file: str,
         *,
         axes: Sequence[int],
         offsets: Mapping[str, Vector],
@@ -256,7 +254,7 @@ class Interpreter:
         start: Vector | None = None,
         one_tool: bool = False,
     ) -> None:
-        self.file, self.axes = file, tuple(axes)
+        self.axes = tuple(axes)
         self.modes = Modes()
         self.tools = Tools(one=one_tool)
         self._offsets = {name: _subtract(zero, origin) for name, zero in offsets.items()}
@@ -279,8 +277,7 @@ class Interpreter:
         Raises:
             GcodeError: If the line contains a word that cannot be corrected.
         """
-        where = f"{self.file}:{line.number}"
-        words, codes = self._collect_words(line, where)
+        words, codes = self._collect_words(line)
         dwell = ends = change = False
         for word in codes:
             if word.letter == "M":
@@ -290,20 +287,20 @@ class Interpreter:
                     self._forget_position()
             elif word.value != self.modes.motion:
                 dwell |= word.value == 4.0
-                self._set_mode(word, where)
+                self._set_mode(word)
         if change or "T" in words:
-            self.tools.read(words.get("T"), load=change, where=where)
+            self.tools.read(words.get("T"), load=change)
         if "F" in words:
             if words["F"] < 0.0:
-                raise GcodeError(f"found a feed of {words['F']:g}", where=where)
+                raise GcodeError(f"found a feed of {words['F']:g}")
             if words["F"] != self.modes.feed:
                 self.modes = replace(self.modes, feed=words["F"])
         if not _ARGUMENTS.isdisjoint(words):
-            self._check_arguments(words, codes, where)
+            self._check_arguments(words, codes)
         moves = not _COORDINATES.isdisjoint(words)
         if moves and dwell:
-            raise GcodeError("found a dwell and coordinates; expected one of them", where=where)
-        step = self._move(line, words, where) if moves else Step(line, self.modes, self.offset)
+            raise GcodeError("found a dwell and coordinates; expected one of them")
+        step = self._move(line, words) if moves else Step(line, self.modes, self.offset)
         if ends:
             self.modes = replace(self.modes, ended=True)
         return step
@@ -334,7 +331,7 @@ class Interpreter:
         self.position[:] = end
         return Step(line, modes, offset, Motion(start, (end[0], end[1], end[2])))
 
-    def _collect_words(self, line: Line, where: str) -> tuple[dict[str, float], list[Word]]:
+    def _collect_words(self, line: Line) -> tuple[dict[str, float], list[Word]]:
         """Values of a line by letter, and its G and M words.
 
         Raises:
@@ -349,28 +346,27 @@ class Interpreter:
             letter = item.letter
             if letter in self._accepted:
                 if letter in words:
-                    raise GcodeError(f"found the word {letter} twice", where=where)
+                    raise GcodeError(f"found the word {letter} twice")
                 words[letter] = item.value
             elif letter == "G":
                 group = GROUPS.get(_tenfold(item.value))
                 if group is None:
-                    _refuse_code(item, where)
+                    _refuse_code(item)
                 if group in groups:
                     raise GcodeError(
-                        f"found {item.code} and another word of its group; expected one",
-                        where=where,
+                        f"found {item.code} and another word of its group; expected one"
                     )
                 groups.add(group)
                 codes.append(item)
             elif letter == "M":
                 if item.value not in M_WORDS:
-                    _refuse_code(item, where)
+                    _refuse_code(item)
                 codes.append(item)
             else:
-                self._refuse_letter(item, where)
+                self._refuse_letter(item)
         return words, codes
 
-    def _refuse_letter(self, word: Word, where: str) -> NoReturn:
+    def _refuse_letter(self, word: Word) -> NoReturn:
         """Refuse a word with another letter.
 
         Raises:
@@ -378,9 +374,9 @@ class Interpreter:
         """
         reason, remedy = REFUSED_LETTERS.get(word.letter, ("an unknown word", "remove it"))
         remedy = remedy.format(axes=", ".join(self._letters.values()))
-        raise GcodeError(f"found {word.text.strip()}, {reason}; {remedy}", where=where)
+        raise GcodeError(f"found {word.text.strip()}, {reason}; {remedy}")
 
-    def _set_mode(self, word: Word, where: str) -> None:
+    def _set_mode(self, word: Word) -> None:
         """Apply a G-word to the modes."""
         code, modes = _tenfold(word.value), self.modes
         match GROUPS[code]:
@@ -398,20 +394,17 @@ class Interpreter:
                 self.modes = replace(modes, centers_absolute=code == 901.0)
             case "feed":
                 if code == 950.0:
-                    _refuse_code(word, where)
+                    _refuse_code(word)
             case "system":
                 name = SYSTEMS[code]
                 if name not in self._offsets:
                     raise GcodeError(
                         f"found {name}, whose zero in machine coordinates is not stated; expected "
-                        f"--work-offset-mm {name}=X,Y,Z (0,0,0 for machine coordinates)",
-                        where=where,
+                        f"--work-offset-mm {name}=X,Y,Z (0,0,0 for machine coordinates)"
                     )
                 self.offset = self._offsets[name]
 
-    def _check_arguments(
-        self, words: Mapping[str, float], codes: Sequence[Word], where: str
-    ) -> None:
+    def _check_arguments(self, words: Mapping[str, float], codes: Sequence[Word]) -> None:
         """Refuse P, Q and the words of arcs on lines without a word that needs them."""
         is_arc = self.modes.motion in (2, 3)
         if "P" in words or "Q" in words:
@@ -419,17 +412,14 @@ class Interpreter:
             belongs_to_code = any((w.letter, w.value) in codes_with_p for w in codes)
             belongs_to_arc = is_arc and not _COORDINATES.isdisjoint(words)
             if not (belongs_to_code or (belongs_to_arc and "Q" not in words)):
-                raise GcodeError("found P or Q without a word that needs it", where=where)
+                raise GcodeError("found P or Q without a word that needs it")
             if belongs_to_code and belongs_to_arc:
-                raise GcodeError(
-                    "found an arc and P for another word; write two lines", where=where
-                )
+                raise GcodeError("found an arc and P for another word; write two lines")
         for letter in ("I", "J", "K", "R"):
             if letter in words and not is_arc:
                 raise GcodeError(
                     f"found {letter}, a word of arcs, and the motion is {self._motion}; expected "
-                    "G2 or G3",
-                    where=where,
+                    "G2 or G3"
                 )
 
     @property
@@ -443,7 +433,7 @@ class Interpreter:
             self.position[k] = None
         self._moved = False
 
-    def _move(self, line: Line, words: Mapping[str, float], where: str) -> Step:
+    def _move(self, line: Line, words: Mapping[str, float]) -> Step:
         """Effect of a line with coordinates.
 
         Raises:
@@ -451,23 +441,21 @@ class Interpreter:
         """
         modes = self.modes
         if modes.motion is None:
-            raise GcodeError("found coordinates without a motion; expected G0 to G3", where=where)
+            raise GcodeError("found coordinates without a motion; expected G0 to G3")
         if modes.motion != 0 and not modes.feed:
             raise GcodeError(
                 f"found {self._motion} without a feed; expected F before it, and again after a "
-                "change of unit",
-                where=where,
+                "change of unit"
             )
         if self._is_unknown_after(words):
-            return self._pass(line, words, where)
-        end = self._end(words, where)
+            return self._pass(line, words)
+        end = self._end(words)
         start = self.position
         first, self._moved = not self._moved, True
         if first and modes.motion != 0:
             raise GcodeError(
                 f"found {self._motion} as the first motion, from a position that is not on the "
-                "corrected path; expected G0 to its start",
-                where=where,
+                "corrected path; expected G0 to its start"
             )
         self.position = list(end)
         self.tools.move(feed=modes.motion != 0)
@@ -475,7 +463,7 @@ class Interpreter:
         if first:
             return Step(line, modes, self.offset, Motion(end, end), has_feed, end_only=True)
         begin: Vector = (start[0] or 0.0, start[1] or 0.0, start[2] or 0.0)
-        arc = None if modes.motion < 2 else self._arc(begin, end, words, where)
+        arc = None if modes.motion < 2 else self._arc(begin, end, words)
         return Step(line, modes, self.offset, Motion(begin, end, arc), has_feed)
 
     def _is_unknown_after(self, words: Mapping[str, float]) -> bool:
@@ -484,19 +472,19 @@ class Interpreter:
             self.position[k] is None and letter not in words for k, letter in self._letters.items()
         )
 
-    def _pass(self, line: Line, words: Mapping[str, float], where: str) -> Step:
+    def _pass(self, line: Line, words: Mapping[str, float]) -> Step:
         """Effect of an uncorrected rapid motion, such as the first one to a safe height."""
         for k, letter in self._letters.items():
             if letter in words:
                 self.position[k] = self._coordinate(
-                    letter, words[letter] * self.modes.unit + self.offset[k], where
+                    letter, words[letter] * self.modes.unit + self.offset[k]
                 )
         self.tools.move(feed=False)
         if self.uncorrected is None:
             self.uncorrected = line.number
         return Step(line, self.modes, self.offset)
 
-    def _end(self, words: Mapping[str, float], where: str) -> Vector:
+    def _end(self, words: Mapping[str, float]) -> Vector:
         """End of a motion, [m].
 
         Raises:
@@ -512,26 +500,24 @@ class Interpreter:
                 names = ", ".join(self._letters.values())
                 raise GcodeError(
                     f"the position along {letter} is unknown before this motion; expected "
-                    f"a first G0 to {names} in G90, or --start-mm",
-                    where=where,
+                    f"a first G0 to {names} in G90, or --start-mm"
                 )
             else:
                 coordinate = position + (value or 0.0) * unit
-            end[k] = self._coordinate(letter, coordinate, where)
+            end[k] = self._coordinate(letter, coordinate)
         return (end[0], end[1], end[2])
 
     @staticmethod
-    def _coordinate(letter: str, value: float, where: str) -> float:
+    def _coordinate(letter: str, value: float) -> float:
         """Coordinate, [m]; refuses one beyond LARGEST_COORDINATE."""
         if not -LARGEST_COORDINATE <= value <= LARGEST_COORDINATE:
             raise GcodeError(
                 f"found {letter} at {value / MM:.6g} mm; expected at most "
-                f"{LARGEST_COORDINATE / MM:g} mm",
-                where=where,
+                f"{LARGEST_COORDINATE / MM:g} mm"
             )
         return value
 
-    def _arc(self, start: Vector, end: Vector, words: Mapping[str, float], where: str) -> Arc:
+    def _arc(self, start: Vector, end: Vector, words: Mapping[str, float]) -> Arc:
         """Geometry of an arc from its words.
 
         Raises:
@@ -542,50 +528,36 @@ class Interpreter:
         if i not in self.axes or j not in self.axes:
             raise GcodeError(
                 f"found an arc in the plane of {AXES[i]} and {AXES[j]}; the drives command "
-                f"{', '.join(self._letters.values())}",
-                where=where,
+                f"{', '.join(self._letters.values())}"
             )
         clockwise = modes.motion == 2
         misplaced = [c for k, c in enumerate(CENTERS) if k not in (i, j) and c in words]
         if misplaced:
             raise GcodeError(
-                f"found {misplaced[0]} with G{modes.plane}; expected {CENTERS[i]} and {CENTERS[j]}",
-                where=where,
+                f"found {misplaced[0]} with G{modes.plane}; expected {CENTERS[i]} and {CENTERS[j]}"
             )
         turns = words.get("P", 1.0)
         if turns != math.floor(turns) or not 1.0 <= turns <= MOST_TURNS:
-            raise GcodeError(
-                f"P is {turns:g}; expected a whole number of turns, 1 to {MOST_TURNS}", where=where
-            )
+            raise GcodeError(f"P is {turns:g}; expected a whole number of turns, 1 to {MOST_TURNS}")
         centers = [c for c in (CENTERS[i], CENTERS[j]) if c in words]
         if centers and "R" in words:
-            raise GcodeError(f"found R and {centers[0]}; expected one of them", where=where)
+            raise GcodeError(f"found R and {centers[0]}; expected one of them")
         if "R" in words:
             radius = words["R"] * modes.unit
-            center = center_of_radius(
-                start, end, radius, plane=modes.plane, clockwise=clockwise, where=where
-            )
+            center = center_of_radius(start, end, radius, plane=modes.plane, clockwise=clockwise)
         else:
             if not centers or (modes.centers_absolute and len(centers) < 2):
                 problem = f"only {centers[0]}" if centers else "an arc without a centre"
-                raise GcodeError(
-                    f"found {problem}; expected {CENTERS[i]} and {CENTERS[j]}, or R", where=where
-                )
+                raise GcodeError(f"found {problem}; expected {CENTERS[i]} and {CENTERS[j]}, or R")
             base = self.offset if modes.centers_absolute else start
             first, second = (base[k] + words.get(CENTERS[k], 0.0) * modes.unit for k in (i, j))
             center = (first, second)
         return arc_about(
-            start,
-            end,
-            center,
-            plane=modes.plane,
-            clockwise=clockwise,
-            turns=int(turns),
-            where=where,
+            start, end, center, plane=modes.plane, clockwise=clockwise, turns=int(turns)
         )
 
 
-def _refuse_code(word: Word, where: str) -> NoReturn:
+def _refuse_code(word: Word) -> NoReturn:
     """Refuse a G or M word.
 
     Raises:
@@ -594,7 +566,7 @@ def _refuse_code(word: Word, where: str) -> NoReturn:
     reason, remedy = REFUSED_CODES.get(
         word.code, ("is unknown", "expected G0 to G3 and words that do not change coordinates")
     )
-    raise GcodeError(f"found {word.code}, which {reason}; {remedy}", where=where)
+    raise GcodeError(f"found {word.code}, which {reason}; {remedy}")
 
 
 @lru_cache(maxsize=256)

@@ -96,23 +96,20 @@ def split_point_line(text: str, number: int) -> PointLine | None:
     return None if match is None or len(text) > LONGEST_LINE else PointLine(number, *match.groups())
 
 
-def split_line(text: str, number: int, *, file: str) -> Line:
+def split_line(text: str, number: int) -> Line:
     """Split a line into words and comments.
 
     Args:
         text: Line with its line end.
         number: Number of the line.
-        file: Name of the program, for messages.
 
     Raises:
-        GcodeError: If a part of the line is neither a word nor a comment.
+        GcodeError: If a part of the line is neither a word nor a comment; without a place.
     """
     body = text.rstrip(" \t\r\n")
-    ending, where = text[len(body) :], f"{file}:{number}"
+    ending = text[len(body) :]
     if len(text) > LONGEST_LINE:
-        raise GcodeError(
-            f"has {len(text)} characters; expected at most {LONGEST_LINE}", where=where
-        )
+        raise GcodeError(f"has {len(text)} characters; expected at most {LONGEST_LINE}")
     words = _WORD.findall(body)
     if sum([len(word[0]) for word in words]) == len(body):  # no comments: the fast case
         items = [Word(letter.upper(), float(digits), word) for word, letter, digits in words]
@@ -122,22 +119,20 @@ def split_line(text: str, number: int, *, file: str) -> Line:
     while position < len(body):
         match = _ITEM.match(body, position)
         if match is None:
-            raise _refuse(body, position, where=where)
+            raise _refuse(body, position)
         letter, digits, comment = match.groups()
         if letter is not None:
             mixed.append(Word(letter.upper(), float(digits), match[0]))
         else:
             control = CONTROL.search(comment)
             if control:
-                raise GcodeError(
-                    f"a comment holds the control character '{control[0]}'", where=where
-                )
+                raise GcodeError(f"a comment holds the control character '{control[0]}'")
             mixed.append(match[0])
         position = match.end()
     return Line(number, tuple(mixed), ending, text)
 
 
-def _refuse(body: str, position: int, *, where: str) -> GcodeError:
+def _refuse(body: str, position: int) -> GcodeError:
     """Error about the part of a line at a position."""
     text = body[position:].lstrip()
     hint = next((f" ({syntax})" for c, syntax in _HINTS.items() if c in text[:2]), "")
@@ -145,6 +140,4 @@ def _refuse(body: str, position: int, *, where: str) -> GcodeError:
         text, hint = body.strip(), " (subroutines and loops)"
     if text[:1] == "(":
         hint = " (a comment without an end)"
-    return GcodeError(
-        f"found '{shorten(text)}'{hint}; expected words such as X1.5 and comments", where=where
-    )
+    return GcodeError(f"found '{shorten(text)}'{hint}; expected words such as X1.5 and comments")

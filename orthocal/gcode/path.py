@@ -142,16 +142,18 @@ class Paths:
             first: Parameter of the start of each part, 0 to 1, shape (k,).
             last: Parameter of the end of each part, shape (k,).
         """
-        c, share = curve, last - first
+        c, share = curve, (last - first)[:, None]
+        begin = first[:, None]
+
+        def part(line: Array) -> Array:
+            """Value at the start of each part, and its change."""
+            return np.hstack([line[c, :1] + begin * line[c, 1:], share * line[c, 1:]])
+
         return Paths(
-            self.base[c] + first[:, None] * self.slope[c],
-            share[:, None] * self.slope[c],
-            np.stack(
-                [self.radius[c, 0] + first * self.radius[c, 1], share * self.radius[c, 1]], axis=1
-            ),
-            np.stack(
-                [self.angle[c, 0] + first * self.angle[c, 1], share * self.angle[c, 1]], axis=1
-            ),
+            self.base[c] + begin * self.slope[c],
+            share * self.slope[c],
+            part(self.radius),
+            part(self.angle),
             self.axes[c],
         )
 
@@ -181,7 +183,6 @@ def arc_about(
     plane: int,
     clockwise: bool,
     turns: int,
-    where: str,
 ) -> Arc:
     """Arc around a centre.
 
@@ -192,7 +193,6 @@ def arc_about(
         plane: Number of the G-word, 17, 18 or 19.
         clockwise: Whether the arc is clockwise (G2), seen from the positive end of the normal.
         turns: Number of times that the arc reaches its end.
-        where: File and line, for messages.
 
     Raises:
         GcodeError: If the radii at the ends differ, or the centre is at an end.
@@ -202,13 +202,12 @@ def arc_about(
     last = (end[i] - center[0], end[j] - center[1])
     r0, r1 = math.hypot(*first), math.hypot(*last)
     if min(r0, r1) < SMALLEST_RADIUS:
-        raise GcodeError("the centre of an arc is at one of its ends", where=where)
+        raise GcodeError("the centre of an arc is at one of its ends")
     tolerance = max(RADIUS_TOLERANCE, min(RELATIVE_RADIUS_TOLERANCE * r0, LARGEST_RADIUS_TOLERANCE))
     if abs(r0 - r1) > tolerance:
         raise GcodeError(
             f"an arc has a radius of {r0 * 1e3:.6g} mm at its start and {r1 * 1e3:.6g} mm at its "
-            "end; expected equal radii",
-            where=where,
+            "end; expected equal radii"
         )
     angle = math.atan2(first[1], first[0])
     sweep = math.atan2(last[1], last[0]) - angle
@@ -224,7 +223,7 @@ def arc_about(
 
 
 def center_of_radius(
-    start: Vector, end: Vector, radius: float, *, plane: int, clockwise: bool, where: str
+    start: Vector, end: Vector, radius: float, *, plane: int, clockwise: bool
 ) -> tuple[float, float]:
     """Centre of an arc with a radius R, in the plane, [m].
 
@@ -234,7 +233,6 @@ def center_of_radius(
         radius: R, [m]; a negative R selects the arc of more than 180°.
         plane: Number of the G-word, 17, 18 or 19.
         clockwise: Whether the arc is clockwise (G2).
-        where: File and line, for messages.
 
     Raises:
         GcodeError: If there is no such arc, or the ends are equal.
@@ -245,15 +243,13 @@ def center_of_radius(
     if distance < SMALLEST_RADIUS:
         raise GcodeError(
             f"found R with both ends at the same {AXES[i]} and {AXES[j]}, which determines no "
-            f"centre; expected {CENTERS[i]} and {CENTERS[j]}",
-            where=where,
+            f"centre; expected {CENTERS[i]} and {CENTERS[j]}"
         )
     half = 0.5 * distance
     if abs(radius) < half - RADIUS_SHORTFALL:
         raise GcodeError(
             f"R is {abs(radius) * 1e3:.6g} mm, less than half the distance of the arc's ends, "
-            f"{half * 1e3:.6g} mm",
-            where=where,
+            f"{half * 1e3:.6g} mm"
         )
     height = math.sqrt(max(radius * radius - half * half, 0.0))
     if clockwise != (radius < 0.0):

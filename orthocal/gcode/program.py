@@ -61,6 +61,7 @@ class ProgramCorrector:
     Args:
         interpreter: New interpreter of the program.
         correct: Correction of points.
+        file: Name of the program, for messages.
         within: Tolerance: largest distance of the written path from the exact corrected path, [m].
         region: Limits of x, y and z, shape (3, 2), [m]. The summary has the first line beyond them.
         sides: Sides of approach of the drives, if the program compensates backlash.
@@ -74,13 +75,14 @@ class ProgramCorrector:
         interpreter: Interpreter,
         correct: Correction,
         *,
+        file: str,
         within: float,
         region: Array | None = None,
         sides: Sides | None = None,
     ) -> None:
         self._interpreter, self._correct, self._region = interpreter, correct, region
         self._sides = sides
-        self._file = interpreter.file
+        self._file = file
         self._writer = Writer(
             interpreter.axes, rounding=ROUNDING * within, start=interpreter.position
         )
@@ -139,10 +141,10 @@ class ProgramCorrector:
         if step is not None:
             return step
         try:
-            return interpreter.read(split_line(text, number, file=self._file))
-        except GcodeError:
+            return interpreter.read(split_line(text, number))
+        except GcodeError as e:
             self._write(pending)  # raises if an earlier line is out of reach
-            raise
+            raise GcodeError(e.problem, where=f"{self._file}:{number}") from None
 
     def _write(self, steps: Sequence[Step | str]) -> str:
         """Corrected text of a block."""

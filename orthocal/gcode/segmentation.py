@@ -159,10 +159,12 @@ def _segment(paths: Paths, correct: MotionCorrection, tolerance: float) -> list[
             )
         refined: list[int] = []
         for group in _groups(pending[counts[pending] <= MOST_SEGMENTS], counts):
-            repeated = _segment_group(paths, group, counts, correct, tolerance, results)
-            for i, count in repeated:
-                counts[i] = count
-                refined.append(i)
+            for i, result in _segment_group(paths, group, counts, correct, tolerance):
+                if isinstance(result, float):
+                    counts[i] = result
+                    refined.append(i)
+                else:
+                    results[i] = result
         pending = np.array(refined, dtype=np.int64)
     return [r for r in results if r is not None]
 
@@ -184,8 +186,7 @@ def _segment_group(
     counts: Array,
     correct: MotionCorrection,
     tolerance: float,
-    results: list[Segments | Refused | None],
-) -> Iterator[tuple[int, float]]:
+) -> Iterator[tuple[int, Segments | Refused | float]]:
     """Divide motions into stated numbers of segments.
 
     Args:
@@ -194,10 +195,9 @@ def _segment_group(
         counts: Number of segments of each motion.
         correct: Correction of points.
         tolerance: Largest distance of the corrected motion from its chords, [m].
-        results: Result of each motion; filled by this function.
 
     Yields:
-        Motions that need more segments, and the next number to try.
+        Each motion with its result, or with the next number to try if it needs more segments.
     """
     n = counts[group].astype(np.int64)
     size = 4 * n + 1
@@ -228,11 +228,9 @@ def _segment_group(
         segments = slice(position, position + count)
         position += count
         if k in reasons:
-            results[i] = reasons[k]
+            yield i, reasons[k]
         elif largest > EVALUATED_SHARE * tolerance:
             # the deviation of a chord grows with the square of its length
-            yield i, max(count + 1.0, math.ceil(count * math.sqrt(largest / tolerance) * 1.05))
+            yield i, float(max(count + 1, math.ceil(count * math.sqrt(largest / tolerance) * 1.05)))
         else:
-            results[i] = Segments(
-                begins[k], ends[segments], stretches[segments], largest, correction
-            )
+            yield i, Segments(begins[k], ends[segments], stretches[segments], largest, correction)

@@ -1,6 +1,6 @@
 """YAML, JSON and CSV from untrusted sources: bounded reading, validation, messages with places.
 
-The caller of a reader chooses the kind of error to raise.
+The caller of a reader of YAML or JSON chooses the kind of error to raise.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
-from orthocal.errors import OrthocalError
+from orthocal.errors import OrthocalError, SessionError
 from orthocal.io.files import read_file
 from orthocal.io.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, load_yaml
 from orthocal.text import composed, list_some, shorten, text_problem, uncapitalised
@@ -261,7 +261,6 @@ def csv_rows(
     name: str,
     required: tuple[str, ...],
     optional: tuple[str, ...] | None = (),
-    error: type[OrthocalError],
     most: int | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Line numbers and cells by column of the rows of a CSV file with a header.
@@ -273,43 +272,57 @@ def csv_rows(
         name: Name of the file, for messages.
         required: Required columns.
         optional: Optional columns; None to ignore all others.
-        error: Kind of error to raise.
         most: Largest number of lines.
 
     Raises:
-        OrthocalError: Of kind `error`, if a row is invalid; names file and line.
+        SessionError: If a row is invalid; names file and line.
     """
     lines = iter(lines)
     first_line = next(lines, "")
     if not first_line.strip():
         problem = "is blank" if any(line.strip() for line in lines) else "is empty"
-        raise error(f"{problem}; expected a header: {','.join(required)}", where=f"{name}:1")
+        raise SessionError(f"{problem}; expected a header: {','.join(required)}", where=f"{name}:1")
     delimiter = ";" if "," not in first_line and ";" in first_line else ","
-    reader = csv.reader(
-        chain([first_line], lines), delimiter=delimiter, skipinitialspace=True, strict=True
-    )
+    rows = csv_cells(chain([first_line], lines), delimiter, name=name, most=most)
+    header = [composed(cell.strip()) for cell in next(rows)[1]]
+    if invalid := _header_problem(header, required, optional):
+        raise SessionError(invalid, where=f"{name}:1")
+    read = [(i, c) for i, c in enumerate(header) if optional is not None or c in required]
+    for line, row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            maybe_comma = delimiter == "," and len(row) > len(header)
+            hint = "; a decimal comma? write a point" if maybe_comma else ""
+            raise SessionError(
+                f"has {len(row)} fields; expected {len(header)} ({delimiter.join(header)}){hint}",
+                where=f"{name}:{line}",
+            )
+        yield line, {c: composed(row[i].strip()) for i, c in read}
+
+
+def csv_cells(
+    lines: Iterable[str], delimiter: str, *, name: str, most: int | None
+) -> Iterator[tuple[int, list[str]]]:
+    """Last line and cells of each row of a CSV file.
+
+    Args:
+        lines: Lines with their line ends.
+        delimiter: Character between cells.
+        name: Name of the file, for messages.
+        most: Largest number of lines; None for any number.
+
+    Raises:
+        SessionError: If quotes do not match, or there are more lines; names file and line.
+    """
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
-        header = [composed(cell.strip()) for cell in next(reader)]
-        if invalid := _header_problem(header, required, optional):
-            raise error(invalid, where=f"{name}:1")
-        read = [(i, c) for i, c in enumerate(header) if optional is not None or c in required]
-        for row in reader:
-            line = reader.line_num
-            if most is not None and line > most:
-                raise error(f"has more than {most} rows", where=name)
-            if not any(cell.strip() for cell in row):
-                continue
-            if len(row) != len(header):
-                maybe_comma = delimiter == "," and len(row) > len(header)
-                hint = "; a decimal comma? write a point" if maybe_comma else ""
-                raise error(
-                    f"has {len(row)} fields; expected {len(header)} "
-                    f"({delimiter.join(header)}){hint}",
-                    where=f"{name}:{line}",
-                )
-            yield line, {c: composed(row[i].strip()) for i, c in read}
+        for cells in reader:
+            if most is not None and reader.line_num > most:
+                raise SessionError(f"has more than {most} rows", where=name)
+            yield reader.line_num, cells
     except csv.Error as e:
-        raise error(f"is not valid CSV: {e}", where=f"{name}:{reader.line_num}") from None
+        raise SessionError(f"is not valid CSV: {e}", where=f"{name}:{reader.line_num}") from None
 
 
 def _header_problem(
@@ -334,9 +347,9 @@ _DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(
 def parse_number(
     text: str,
     *,
-    where: str,
     name: str,
     error: type[OrthocalError],
+    where: str | None = None,
     largest: float = LARGEST_NUMBER,
 ) -> float:
     """Finite number in a CSV field.

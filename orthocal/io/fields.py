@@ -7,7 +7,6 @@ file, null represents NaN or infinity only.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -15,12 +14,12 @@ from numpy.typing import ArrayLike
 from pydantic import (
     ConfigDict,
     Field,
-    GetCoreSchemaHandler,
+    GetPydanticSchema,
     PlainSerializer,
     ValidatorFunctionWrapHandler,
     WrapValidator,
 )
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import core_schema
 
 from orthocal.arrays import Array
 from orthocal.io.documents import LARGEST_NUMBER, Number
@@ -62,22 +61,15 @@ SizeOrInf = Annotated[Size, _null_for(math.inf), PlainSerializer(finite_or_none)
 """Numbers that may be unknown or infinite."""
 
 
-class _AsLists:
+def _as_lists(lists: Any) -> GetPydanticSchema:  # noqa: ANN401 - a type
     """Array in memory, nested lists in a file, where null replaces numbers that are not finite."""
-
-    def __init__(self, lists: Any) -> None:  # noqa: ANN401 - a type
-        self.lists = lists
-
-    def __get_pydantic_core_schema__(
-        self,
-        source: Any,  # noqa: ANN401 - a type
-        handler: GetCoreSchemaHandler,
-    ) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(
+    return GetPydanticSchema(
+        lambda _, handler: core_schema.no_info_after_validator_function(
             _to_array,
-            handler.generate_schema(self.lists),
+            handler.generate_schema(lists),
             serialization=core_schema.plain_serializer_function_ser_schema(_to_lists),
         )
+    )
 
 
 _Entry = Annotated[
@@ -85,31 +77,9 @@ _Entry = Annotated[
 ]
 """Number of an array, which pydantic checks without calling Python."""
 
-Vector = Annotated[Array, _AsLists(Many[_Entry])]
-Sizes = Annotated[Array, _AsLists(Many[Annotated[_Entry, Field(ge=0.0)]])]
-Matrix = Annotated[Array, _AsLists(Many[Many[_Entry | None]])]
-
-
-class As:
-    """Annotation of a field that functions read from and write to plain data.
-
-    Args:
-        read: Function from plain data to the value; raises ValueError("KEY|PROBLEM").
-        write: Function from the value to plain data.
-    """
-
-    def __init__(self, read: Callable[[Any], object], write: Callable[[Any], object]) -> None:
-        self.read, self.write = read, write
-
-    def __get_pydantic_core_schema__(
-        self,
-        source: Any,  # noqa: ANN401 - a type
-        handler: GetCoreSchemaHandler,
-    ) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            self.read,
-            serialization=core_schema.plain_serializer_function_ser_schema(self.write),
-        )
+Vector = Annotated[Array, _as_lists(Many[_Entry])]
+Sizes = Annotated[Array, _as_lists(Many[Annotated[_Entry, Field(ge=0.0)]])]
+Matrix = Annotated[Array, _as_lists(Many[Many[_Entry | None]])]
 
 
 def _to_array(lists: Any) -> Array:  # noqa: ANN401 - tuples of tuples

@@ -8,7 +8,7 @@ import re
 import stat
 from codecs import getincrementaldecoder
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from io import IncrementalNewlineDecoder
 from itertools import chain
 from pathlib import Path
@@ -27,7 +27,6 @@ BLOCK_SIZE = 2**16
 _READ_FLAGS = (
     os.O_RDONLY
     | getattr(os, "O_BINARY", 0)
-    | getattr(os, "O_CLOEXEC", 0)
     | getattr(os, "O_NOCTTY", 0)
     | getattr(os, "O_NONBLOCK", 0)  # opening a pipe without a writer would block
 )
@@ -81,15 +80,13 @@ def read_parts(
     Raises:
         OrthocalError: Of kind `error`, if the file is missing, not regular, or cannot be read.
     """
-    stream = open(_open_regular(path, error), "rb") if isinstance(path, Path) else path
-    try:
-        while part := stream.readline(longest):
-            yield part
-    except OSError as e:
-        raise error(f"cannot be read: {e.strerror}", where=name) from None
-    finally:
-        if isinstance(path, Path):
-            stream.close()
+    source = open(_open_regular(path, error), "rb") if isinstance(path, Path) else nullcontext(path)
+    with source as stream:
+        try:
+            while part := stream.readline(longest):
+                yield part
+        except OSError as e:
+            raise error(f"cannot be read: {e.strerror}", where=name) from None
 
 
 def read_lines(

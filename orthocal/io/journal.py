@@ -96,9 +96,8 @@ def open_journal_file(
     require_writable_file(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
         created = not path.exists()
-        descriptor = os.open(path, flags, 0o666)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     except OSError as e:
         raise OutputError(f"cannot be written: {e.strerror}", where=str(path)) from None
     try:

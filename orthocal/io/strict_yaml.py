@@ -65,8 +65,6 @@ class _Loader(_Base):  # type: ignore[misc] # either of PyYAML's safe loaders
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Value of a mapping without duplicate keys."""
-        if not isinstance(node, yaml.MappingNode):
-            raise _error("expected keys and values", node)
         keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
 from orthocal.effects.adjustment import subtract_amounts
@@ -19,7 +18,7 @@ from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
-from orthocal.session.session import Posture, Session, Setup, split_label
+from orthocal.session.session import Session, Setup, split_label
 from orthocal.text import composed
 
 CACHE_SIZE = 4
@@ -71,7 +70,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     if len(sessions) == 1:
         return sessions[0]
     if settings := sessions[0].firmware:
-        sessions = on_one_printer(sessions, sessions[0].robot, settings.homed)
+        sessions = [s.on_printer(sessions[0].robot, settings.homed) for s in sessions]
     last = sessions[-1]
     _require_same_machine(sessions)
     purposes = {s.purpose for s in sessions} - {None}
@@ -117,17 +116,6 @@ def require_another(session: Session, sessions: Sequence[Session]) -> None:
                 "is the same session as one before it; its readings would count twice",
                 where=str(member.path or "session"),
             )
-
-
-def on_one_printer(sessions: Sequence[Session], robot: Robot, homed: ArrayLike) -> list[Session]:
-    """Sessions of a printer in the coordinates of one robot; others are returned unchanged.
-
-    Args:
-        sessions: Sessions, each with settings of a firmware or without.
-        robot: Robot with the nominal dimensions of one of the settings.
-        homed: Coordinates of its homed carriages, shape (3,), [m].
-    """
-    return [s if s.firmware is None else s.on_printer(robot, homed) for s in sessions]
 
 
 def _require_same_machine(sessions: Sequence[Session]) -> None:
@@ -311,14 +299,11 @@ def _rename(session: Session, labels: Mapping[str, str]) -> Session:
             compensation=session.compensation if s.compensation is None else s.compensation,
         )
 
-    def posture(p: Posture) -> Posture:
-        return replace(p, name=named(p.name))
-
     return replace(
         session,
         gauges={named(name): gauge for name, gauge in session.gauges.items()},
         setups={named(s.name): setup(s) for s in session.setups.values()},
-        postures={named(p.name): posture(p) for p in session.postures.values()},
+        postures={named(n): replace(p, name=named(n)) for n, p in session.postures.items()},
         readings=tuple(
             replace(
                 r,

@@ -1,7 +1,8 @@
-"""Rows of a recording and their changes.
+"""Rows of a recording, their changes, and the lines of its journal.
 
 An approach is planned, or the operator types it with the reading. The CSV has one column for both.
 The changes state which approaches were typed: they are corrected and deleted with their readings.
+Each change is a line of the journal with the digests of the CSV before and after it.
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from orthocal.errors import SessionError
-from orthocal.io.documents import Keys, Number
-from orthocal.measurement.files.session_keys import LARGEST_READING_MM
+from orthocal.errors import OrthocalError, SessionError
+from orthocal.io.documents import Keys, Number, validate
+from orthocal.io.journal import Journal
+from orthocal.measurement.files.session_keys import ReadingLimit
 from orthocal.sensors.points import Coordinate
 from orthocal.session.points import base_name
 from orthocal.session.session import Conditions, Reading, ReadingKey, Session, known_approach
@@ -32,9 +34,7 @@ class Change(Keys):
     change together."""
     rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
     """Keys of the row, or of the three rows of a point, then of as many added rows."""
-    reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
-        None
-    )
+    reading_mm: ReadingLimit | None = None
     point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
     """Readings of the three rows of a point."""
     conditions: Conditions | None = None
@@ -182,3 +182,97 @@ def find_dropped(session: Session, changes: Iterable[Change]) -> dict[int, list[
         for line, keys in dropped.items()
         if all(k[0] in session.setups and postures.issuperset(k[1:3]) for k in keys)
     }
+
+
+FORMAT = "orthocal/recording/1"
+
+CLOSED: dict[str, Any] = {"closed": True}
+"""Last line of a recording that ended regularly."""
+
+
+class JournalLine(Change):
+    """Line of a change."""
+
+    at: str
+    """Time of the change."""
+    before: str
+    """Digest of the CSV before the change."""
+    after: str
+    """Digest of the CSV after it."""
+
+
+class NextConditions(Keys):
+    """Line of the journal: conditions that were typed for the next readings."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    temperature: Annotated[Number | None, Field(alias="temperature_C")] = None
+    """Temperature, [°C]."""
+    approach: str | None = None
+    """Approach; see `Conditions`."""
+    clock: bool | None = None
+    """Whether the time of each reading is noted."""
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The stated conditions by their keys in the journal."""
+        return self.model_dump(exclude_none=True, by_alias=True)
+
+
+def read_lines(
+    journal: Journal,
+) -> tuple[list[JournalLine], list[tuple[str, JournalLine]], NextConditions]:
+    """Content of a journal; a new one gets its header.
+
+    Returns:
+        Changes of the recordings that ended regularly, later changes with their places, and the
+        conditions that were typed last.
+    """
+    following = NextConditions()
+    closed: list[JournalLine] = []
+    lines: list[tuple[str, JournalLine]] = []
+    entries = journal.entries()
+    first = next(entries, None)
+    if first is None:
+        journal.append({"format": FORMAT})
+    elif (first[1] or {}).get("format") != FORMAT:
+        raise OrthocalError(
+            "is not the journal of a recording; move it away, and the readings count as they are",
+            where=str(journal.path),
+        )
+    for where, data in entries:
+        if data == CLOSED:
+            closed += [line for _, line in lines]
+            lines.clear()
+            continue
+        try:
+            if data and "done" not in data:
+                noted = validate(NextConditions, data, where=where, error=OrthocalError)
+                following = NextConditions(**following.stated | noted.stated)
+            else:
+                line = validate(JournalLine, data, where=where, error=OrthocalError)
+                lines.append((where, line))
+        except OrthocalError:
+            raise OrthocalError(
+                "is not a line of a recording: the journal is damaged; move it away, and the "
+                "readings count as they are",
+                where=where,
+            ) from None
+    return closed, lines, following
+
+
+def find_pending(
+    lines: Sequence[tuple[str, JournalLine]], digest: str
+) -> tuple[Sequence[tuple[str, JournalLine]], bool]:
+    """Changes that the CSV does not contain yet, and whether the CSV was edited since.
+
+    Args:
+        lines: Places and lines of the journal.
+        digest: Digest of the CSV.
+    """
+    if not lines or lines[-1][1].after == digest:
+        return [], False
+    for i in range(len(lines) - 1, -1, -1):
+        if lines[i][1].before == digest:
+            return lines[i:], False
+    return [], True

@@ -22,30 +22,27 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import OrthocalError, OutputError, SessionError
+from orthocal.errors import OrthocalError, OutputError, SessionError, errors_at
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.point_rows import (
-    find_point,
-    locate_stations,
-    point_of,
-    value_name,
-)
+from orthocal.measurement.files.point_rows import find_point, locate_stations, point_of
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
-from orthocal.measurement.files.session_edits import add_alignment, add_readings
 from orthocal.measurement.files.session_file import load_plan, session_digest
 from orthocal.measurement.files.session_keys import MOST_READINGS
-from orthocal.measurement.files.write_session import readings_table
+from orthocal.measurement.files.write_session import add_alignment, add_readings, readings_table
 from orthocal.measurement.motion.motion import state_possible_path_approaches
 from orthocal.measurement.recorded_rows import (
+    CLOSED,
     Change,
+    NextConditions,
     RecordedReading,
     change_rows,
     find_dropped,
+    find_pending,
+    read_lines,
     recorded_rows,
 )
-from orthocal.measurement.recording_journal import CLOSED, NextConditions, find_pending, read_lines
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.protocol import largest_reading
 from orthocal.session.order import order_of_measurement
@@ -197,27 +194,18 @@ class Recording:
         if np.isnan(value).any():
             where = rows[0].label_with_cycle
             raise SessionError("reading_mm is nan; expected a number", where=where)
-        setups = [self.session.setups[row.setup] for row in rows]
         conditions = conditions or Conditions()
         readings_mm = []
-        for row, setup in zip(rows, setups, strict=True):
+        for row in rows:
+            setup = self.session.setups[row.setup]
             along = getattr(setup.sensor, "along", None)
             reading = to_mm(float(value if along is None else np.dot(along, value)))
-            check_range(
-                reading,
-                self.session.gauges[setup.gauge],
-                difference=self.session.is_difference(row),
-                where=row.label_with_cycle,
-                name=value_name(row.setup),
-                largest=largest_reading(setup.sensor),
-                of_setup_mm=[r.value / MM for r in self.rows if r.setup == row.setup and r.is_read],
-            )
-            check_conditions(
-                conditions,
-                self.session.robot,
-                two_postures=row.minus is not None,
-                where=row.label_with_cycle,
-            )
+            of_setup_mm = [r.value / MM for r in self.rows if r.setup == row.setup and r.is_read]
+            with errors_at(row.label_with_cycle):
+                gauge = self.session.gauges[setup.gauge]
+                check_range(reading, setup, gauge, minus=row.minus, of_setup_mm=of_setup_mm)
+                two_postures = row.minus is not None
+                check_conditions(conditions, self.session.robot, two_postures=two_postures)
             readings_mm.append(round(reading, DECIMALS))
         stated = _conditions_to_state(rows[0], conditions)
         keys: list[ReadingKey] = [row.key for row in rows]
@@ -401,8 +389,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
-        past = read_lines(journal)
-        closed, lines = past.closed, past.lines
+        closed, lines, following = read_lines(journal)
         if _is_outdated(session):  # another process may have written before the lock
             session = load_plan(path, wrong=wrong)
         for file, content in _files_to_add(session).items():
@@ -428,7 +415,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             journal,
             _digest(table),
             find_dropped(session, [*closed, *(change for _, change in lines)]),
-            past.following,
+            following,
             len(pending),
             edited,
             wrong,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Mask, Triple
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
@@ -28,7 +28,6 @@ from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import (
     Sensor,
-    Triple,
     default_zero,
     place_point,
     probing_direction,

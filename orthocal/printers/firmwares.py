@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from orthocal.errors import SessionError
 from orthocal.printers import klipper, marlin, reprapfirmware
-from orthocal.printers.log import PrinterLog
+from orthocal.printers.log import LogText, PrinterLog
 from orthocal.printers.settings import DeltaSettings, FirmwareName
 
 
@@ -18,7 +18,7 @@ class Firmware:
     title: str
     recognise: Callable[[str], bool]
     """Function that recognises a log."""
-    read_log: Callable[..., PrinterLog]
+    read_log: Callable[[LogText], PrinterLog]
     """Function that reads a log."""
     config_lines: Callable[[DeltaSettings], str]
     """Function that writes settings."""

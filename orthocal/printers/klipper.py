@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.arrays import Array, triple
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import LARGEST_NUMBER, parse_number
 from orthocal.printers.klipper_print import Distances, has_analysis, read_analysis, saved_distances
 from orthocal.printers.log import (
@@ -45,6 +45,7 @@ PROBES = ("probe", "bltouch", "smart_effector", "probe_eddy_current", "beacon", 
 """Kinds of sections with the offsets of a probe; a name may follow in the section's title."""
 
 TOWERS = "abc"
+STEPPERS = tuple(f"stepper_{tower}" for tower in TOWERS)
 Sections = Mapping[str, Mapping[str, str]]
 Pairs = list[tuple[float, tuple[float, float, float]]]
 """Pairs of height, [mm], and stable position, [steps]."""
@@ -67,17 +68,12 @@ def recognise(text: str) -> bool:
     )
 
 
-def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
+def read_log(source: LogText) -> PrinterLog:
     """Read settings, triggers and printed distances.
-
-    Args:
-        source: The log and files with settings.
-        radius: Not used.
 
     Raises:
         SessionError: If the text is invalid; names the key or line.
     """
-    del radius
     log = _read_heights(source)
     printed = read_analysis(source, log.settings)
     return replace(log, distances=printed) if printed else log
@@ -92,38 +88,38 @@ def _read_heights(source: LogText) -> PrinterLog:
     Raises:
         SessionError: If a line of the probe is damaged, or there are too few points.
     """
-    text, where = source.text, source.name
+    text = source.text
     files = " and ".join(name for name, _ in source.files)
     if runs := list(_RUN.finditer(text)):
         begin = runs[-1].start()
-        probe = _probe_offset(_sections_before(text, begin), where)
-        return _read_run(runs[-1], probe, source.place(begin))
+        probe = _probe_offset(_sections_before(text, begin), files)
+        with errors_at(source.place(begin)):
+            return _read_run(runs[-1], probe)
     matches = sorted(
         [*_OLD_PROBE.finditer(text), *_NEW_PROBE.finditer(text)], key=lambda m: m.start()
     )
     _require_points(source)
     begin = 0 if has_analysis(source) and not matches else source.begin
-    saved = _sections(text[begin:]).get("delta_calibrate", {})
-    steps = _saved_heights(saved, where)
+    steps = _saved_heights(_sections(text[begin:]), source.name)
     notes = []
     if steps is not None and matches and _first_saved(text) < matches[-1].start():
         notes.append(f"{len(steps[0])} saved heights are not used: they are older.")
     elif steps is not None:
         sections = _sections(text)
-        settings = _settings(sections, _probe_offset(sections, where), files)
-        return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
+        settings = _settings(sections, files)
+        return _log_from_steps(*steps, settings, _step_lengths(sections, files))
     points = np.array([_probed(m, source) for m in matches]).reshape(-1, 3) * MM
     positions = [m.start() for m in matches]
     used, of_probings = last_probing(points, positions, source)
     notes += of_probings
     sections = _sections_before(text, positions[used.stop - 1] if positions else len(text))
-    settings = _settings(sections, _probe_offset(sections, where), files)
+    settings = _settings(sections, files)
     contacts = [m.re is _NEW_PROBE for m in matches]  # newer versions print the point of contact
     points -= np.outer(contacts, settings.probe)
-    name, keys = _probe_section(sections)
-    if "z_offset" not in keys:
+    name = _probe_section(sections)
+    if "z_offset" not in sections.get(name, {}):
         notes.append(unstated_trigger(f"z_offset in [{name}]"))
-    return probed_log(settings, points[used], where=where, expected=EXPECTED, notes=notes)
+    return probed_log(settings, points[used], expected=EXPECTED, notes=notes)
 
 
 def _first_saved(text: str) -> int:
@@ -179,8 +175,8 @@ def _require_plausible(*values: object) -> None:
             raise ValueError
 
 
-def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
-    """Settings and triggers of a calculation in klippy.log; `line` is its file and line."""
+def _read_run(run: re.Match[str], probe: Array) -> PrinterLog:
+    """Settings and triggers of a calculation in klippy.log."""
     try:
         heights, lengths, values = (ast.literal_eval(v) for v in run.groups())
         distances = [(float(d), [[*map(float, p)], [*map(float, q)]]) for d, p, q in lengths]
@@ -192,20 +188,18 @@ def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
             [value[f"angle_{k}"] for k in TOWERS],
             [value[f"endstop_{k}"] for k in TOWERS],
             probe,
-            line,
         )
         steps = np.array([value[f"stepdist_{k}"] for k in TOWERS]) * MM
         _require_plausible(pairs, distances, [*value.values()])
     except _DAMAGED as e:
         raise SessionError(
             f"the calculation of delta_calibrate is damaged ({type(e).__name__}); expected lists "
-            "of heights, distances and parameters as Klipper writes them",
-            where=line,
+            "of heights, distances and parameters as Klipper writes them"
         ) from None
     # heights of the probe follow the manual ones, and all are its z_offset
     manual = [pair for pair in pairs if pair[0] != pairs[-1][0]]
     probed = [pair for pair in pairs if pair[0] == pairs[-1][0]]
-    return _log_from_steps(probed, manual, distances, settings, steps, line)
+    return _log_from_steps(probed, manual, distances, settings, steps)
 
 
 def _log_from_steps(
@@ -214,7 +208,6 @@ def _log_from_steps(
     distances: Distances,
     settings: DeltaSettings,
     steps: Array,
-    where: str,
 ) -> PrinterLog:
     """Log from stable positions.
 
@@ -224,7 +217,6 @@ def _log_from_steps(
         distances: Saved distances.
         settings: The settings.
         steps: Travel of each carriage per step, shape (3,), [m].
-        where: File and line, for messages.
     """
     notes, height = list[str](), settings.probe[2]
     if height and pairs and not pairs[-1][0]:  # METHOD=manual: the nozzle touched the bed
@@ -236,32 +228,30 @@ def _log_from_steps(
         )
     else:
         pairs = [*manual, *pairs]
-    require_points(len(pairs), where=where, expected=EXPECTED)
-    settings.require_plausible(where=where)
-    stable = np.array([s for _, s in pairs])
-    if stable.shape != (len(pairs), 3) or not np.isfinite(stable).all():
-        raise SessionError("expected three step counts per height", where=where)
+    require_points(len(pairs), EXPECTED)
+    settings.require_plausible()
     if not settings.probe[2]:  # not stated: the height of the triggers replaces it
         settings = replace(settings, probe=(*settings.probe[:2], -pairs[-1][0] * MM))
     heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
-    carriages = np.array(settings.homed) - stable * steps
+    carriages = np.array(settings.homed) - np.array([s for _, s in pairs]) * steps
     return PrinterLog(
         settings,
         carriages,
         heights,
         (*notes, *unusual_content(settings, carriages)),
-        saved_distances(settings, steps, distances, where=where),
+        saved_distances(settings, steps, distances),
     )
 
 
-def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, Distances] | None:
+def _saved_heights(sections: Sections, where: str) -> tuple[Pairs, Pairs, Distances] | None:
     """Heights of the probe, manual heights and distances; None without any."""
+    saved = sections.get("delta_calibrate", {})
     pairs_by_kind: list[Pairs] = []
     for prefix in ("height", "manual_height"):
         pairs: Pairs = []
         while (key := f"{prefix}{len(pairs)}") in saved:
             a, b, c = _saved_steps(saved, f"{key}_pos", where)
-            pairs.append((_number(saved, key, where, "delta_calibrate"), (a, b, c)))
+            pairs.append((_number(sections, "delta_calibrate", key, where), (a, b, c)))
         if len(pairs) < sum(re.fullmatch(rf"{prefix}\d+", k) is not None for k in saved):
             raise SessionError(
                 "is missing, but a later one is there; expected the complete list that SAVE_CONFIG "
@@ -272,46 +262,48 @@ def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, 
     distances: Distances = []
     while (key := f"distance{len(distances)}") in saved:
         ends = [_saved_steps(saved, f"{key}_pos{i}", where) for i in (1, 2)]
-        distances.append((_number(saved, key, where, "delta_calibrate"), ends))
+        distances.append((_number(sections, "delta_calibrate", key, where), ends))
     return (pairs_by_kind[0], pairs_by_kind[1], distances) if pairs_by_kind[0] else None
 
 
 def _saved_steps(saved: Mapping[str, str], key: str, where: str) -> list[float]:
     """Stable position of a key."""
-    where = f"{where}: [delta_calibrate] {key}"
-    position = numbers(saved.get(key, "").split(","), where=where, name="steps")
-    if len(position) != 3:
-        raise SessionError(f"found {len(position)} numbers; expected 3", where=where)
+    with errors_at(f"{where}: [delta_calibrate] {key}"):
+        position = numbers(saved.get(key, "").split(","), name="steps")
+        if len(position) != 3:
+            raise SessionError(f"found {len(position)} numbers; expected 3")
     return position
 
 
-def _settings(sections: Sections, probe: Array, where: str) -> DeltaSettings:
+def _settings(sections: Sections, where: str) -> DeltaSettings:
     """Settings of the sections [printer] and [stepper_a] to [stepper_c].
 
     The defaults of arm_length and position_endstop are those of tower a.
     """
-    printer = sections.get("printer", {})
-    kinematics = printer.get("kinematics", "delta")
+    kinematics = sections.get("printer", {}).get("kinematics", "delta")
     if kinematics != "delta":
         raise SessionError(
             f"found '{shorten(kinematics)}'; expected delta",
             where=f"{where}: [printer] kinematics",
         )
-    steppers = []
-    for k in TOWERS:
-        if f"stepper_{k}" not in sections:
-            raise SessionError(f"has no section [stepper_{k}]; expected {EXPECTED}", where=where)
-        steppers.append({**sections["stepper_a"], **sections[f"stepper_{k}"]})
+    for name in STEPPERS:
+        if name not in sections:
+            raise SessionError(f"has no section [{name}]; expected {EXPECTED}", where=where)
+    filled = {
+        **sections,
+        **{name: {**sections[STEPPERS[0]], **sections[name]} for name in STEPPERS},
+    }
     rods, endstops = (
-        [_number(s, key, where, f"stepper_{k}") for k, s in zip(TOWERS, steppers, strict=True)]
+        [_number(filled, name, key, where) for name in STEPPERS]
         for key in ("arm_length", "position_endstop")
     )
     angles = [
-        _number(sections[f"stepper_{k}"], "angle", where, f"stepper_{k}", default=design / DEG)
-        for k, design in zip(TOWERS, DESIGN_ANGLES, strict=True)
+        _number(sections, name, "angle", where, default=design / DEG)
+        for name, design in zip(STEPPERS, DESIGN_ANGLES, strict=True)
     ]
-    radius = _number(printer, "delta_radius", where, "printer")
-    return _with_endstops(radius, rods, angles, endstops, probe, where)
+    radius = _number(sections, "printer", "delta_radius", where)
+    with errors_at(where):
+        return _with_endstops(radius, rods, angles, endstops, _probe_offset(sections, where))
 
 
 def _with_endstops(
@@ -320,52 +312,48 @@ def _with_endstops(
     angles: list[float],
     endstops: list[float],
     probe: Array,
-    where: str,
 ) -> DeltaSettings:
     """Settings from Klipper's values in mm and degrees; the probe is in m."""
     for rod, k in zip(rods, TOWERS, strict=True):
         if not 0.0 < radius < rod:
             raise SessionError(
                 f"delta_radius is {radius:g}, arm_length of tower {k} {rod:g}; expected a positive "
-                "radius and longer rods",
-                where=where,
+                "radius and longer rods"
             )
     homed = [e + math.sqrt(rod**2 - radius**2) for e, rod in zip(endstops, rods, strict=True)]
     return DeltaSettings(
         "klipper",
         radius * MM,
-        (rods[0] * MM, rods[1] * MM, rods[2] * MM),
-        (homed[0] * MM, homed[1] * MM, homed[2] * MM),
-        (angles[0] * DEG, angles[1] * DEG, angles[2] * DEG),
-        probe=(float(probe[0]), float(probe[1]), float(probe[2])),
+        triple(rods, MM),
+        triple(homed, MM),
+        triple(angles, DEG),
+        probe=triple(probe),
     )
 
 
 def _probe_offset(sections: Sections, where: str) -> Array:
     """Position of the probe's tip at the trigger relative to the nozzle, (3,), [m]; default 0."""
-    name, keys = _probe_section(sections)
-    x, y, z = (_number(keys, f"{axis}_offset", where, name, default=0.0) for axis in "xyz")
+    name = _probe_section(sections)
+    x, y, z = (_number(sections, name, f"{axis}_offset", where, default=0.0) for axis in "xyz")
     return np.array([x, y, 0.0 - z]) * MM
 
 
-def _probe_section(sections: Sections) -> tuple[str, Mapping[str, str]]:
-    """Name and keys of the first section of a probe; by default [probe] without keys."""
-    probes = ((name, keys) for name, keys in sections.items() if name.split(" ")[0] in PROBES)
-    return next(probes, ("probe", {}))
+def _probe_section(sections: Sections) -> str:
+    """Name of the first section of a probe; probe without one."""
+    return next((name for name in sections if name.split(" ")[0] in PROBES), "probe")
 
 
 def _step_lengths(sections: Sections, where: str) -> Array:
     """Travel of each carriage per step, shape (3,), [m]."""
     lengths = []
-    for k in TOWERS:
-        keys, name = sections[f"stepper_{k}"], f"stepper_{k}"
-        if "step_distance" in keys:
-            lengths.append(_number(keys, "step_distance", where, name))
+    for name in STEPPERS:
+        if "step_distance" in sections[name]:
+            lengths.append(_number(sections, name, "step_distance", where))
             continue
-        distance = _number(keys, "rotation_distance", where, name)
-        microsteps = _number(keys, "microsteps", where, name)
-        steps = _number(keys, "full_steps_per_rotation", where, name, default=200.0)
-        gears = re.findall(rf"({NUMBER})\s*:\s*({NUMBER})", keys.get("gear_ratio", ""))
+        distance = _number(sections, name, "rotation_distance", where)
+        microsteps = _number(sections, name, "microsteps", where)
+        steps = _number(sections, name, "full_steps_per_rotation", where, default=200.0)
+        gears = re.findall(rf"({NUMBER})\s*:\s*({NUMBER})", sections[name].get("gear_ratio", ""))
         ratio = math.prod(float(a) / float(b) for a, b in gears if float(b))
         if not distance * microsteps * steps * ratio > 0.0:
             raise SessionError("expected positive numbers", where=f"{where}: [{name}]")
@@ -374,19 +362,19 @@ def _step_lengths(sections: Sections, where: str) -> Array:
 
 
 def _number(
-    keys: Mapping[str, str], key: str, where: str, section: str, *, default: float | None = None
+    sections: Sections, section: str, key: str, where: str, *, default: float | None = None
 ) -> float:
     """Number of a key.
 
     Raises:
         SessionError: If the key is missing or not a number.
     """
-    where = f"{where}: [{section}]"
-    if key not in keys:
-        if default is None:
-            raise SessionError(f"has no {key}; expected a number", where=where)
-        return default
-    return parse_number(keys[key], where=where, name=key, error=SessionError)
+    keys, where = sections.get(section, {}), f"{where}: [{section}]"
+    if key in keys:
+        return parse_number(keys[key], where=where, name=key, error=SessionError)
+    if default is None:
+        raise SessionError(f"has no {key}; expected a number", where=where)
+    return default
 
 
 def _sections(text: str) -> dict[str, dict[str, str]]:

@@ -13,7 +13,7 @@ import re
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.printers.log import LogText, PrintedDistance, numbers
 from orthocal.printers.settings import DeltaSettings
 from orthocal.units import DEG, MM
@@ -71,35 +71,33 @@ def read_analysis(source: LogText, settings: DeltaSettings) -> tuple[PrintedDist
     """
     values: dict[str, list[float]] = {}
     for command in _COMMAND.finditer(source.text):
-        line = source.place(command.start(1))
         for word in _WORD.finditer(command[1]):
             name = word[1].upper()
             if name in COUNTS or name == "SCALE":
-                values[name] = _lengths(name, word[2], line)
+                with errors_at(source.place(command.start(1))):
+                    values[name] = _lengths(name, word[2])
     measured = [name for name in COUNTS if name in values]
     if not measured:
         return ()
     if missing := [name for name in COUNTS if name not in values]:
         raise SessionError(
             f"DELTA_ANALYZE states {', '.join(measured)} but not {', '.join(missing)}; expected "
-            "all four",
-            where=source.name,
+            "all four"
         )
     (scale,) = values.get("SCALE", [1.0])
     return _place(values, scale, settings)
 
 
-def _lengths(name: str, text: str, where: str) -> list[float]:
+def _lengths(name: str, text: str) -> list[float]:
     """Positive numbers of a parameter of `DELTA_ANALYZE`."""
     parts = text.strip("[]").split(",")  # klippy.log has brackets
-    values, count = numbers(parts, where=where, name=name), COUNTS.get(name, 1)
+    values, count = numbers(parts, name=name), COUNTS.get(name, 1)
     if len(values) != count:
-        raise SessionError(f"{name} has {len(values)} numbers; expected {count}", where=where)
+        raise SessionError(f"{name} has {len(values)} numbers; expected {count}")
     for value in values:
         if not 0.0 < value <= LARGEST_MM:
             raise SessionError(
-                f"{name} has {value:g}; expected numbers above 0 and at most {LARGEST_MM:g}",
-                where=where,
+                f"{name} has {value:g}; expected numbers above 0 and at most {LARGEST_MM:g}"
             )
     return values
 
@@ -146,7 +144,7 @@ def ends(scale: float) -> tuple[Array, Array]:
 
 
 def saved_distances(
-    settings: DeltaSettings, steps: Array, distances: Distances, *, where: str
+    settings: DeltaSettings, steps: Array, distances: Distances
 ) -> tuple[PrintedDistance, ...]:
     """Distances that Klipper saved with stable positions, without the widths of pillars.
 
@@ -154,7 +152,6 @@ def saved_distances(
         settings: The settings.
         steps: Travel of each carriage per step, shape (3,), [m].
         distances: The distances.
-        where: Name of the log, for messages.
 
     Raises:
         SessionError: If a distance is invalid; names it.
@@ -163,12 +160,11 @@ def saved_distances(
     for i, (length, stable) in enumerate(distances):
         positions = np.array(stable)
         if positions.shape != (2, 3) or not np.isfinite(positions).all():
-            raise SessionError(f"distance {i}: expected three step counts at each end", where=where)
+            raise SessionError(f"distance {i}: expected three step counts at each end")
         if not 0.0 < length <= LARGEST_MM:
             raise SessionError(
                 f"distance {i} is {length:g}; expected a number above 0 and at most "
-                f"{LARGEST_MM:g} mm",
-                where=where,
+                f"{LARGEST_MM:g} mm"
             )
         carriages = np.array(settings.homed) - positions[::-1] * steps
         printed.append(PrintedDistance(f"distance_{i + 1}", length * MM, carriages))

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
-from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
+from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings, FirmwareName
 from orthocal.units import DEG, MM
 
 MIN_POINTS = 3
@@ -27,6 +27,9 @@ LARGEST_COORDINATE = 2.0
 
 SAME_PLACE = 0.05 * MM
 """Largest distance of successive probings that are samples of one point, along x or y, [m]."""
+
+DECIMALS = 4
+"""Decimals of settings in G-code."""
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
@@ -79,6 +82,8 @@ class LogText:
 
     files: tuple[tuple[str, str], ...]
     """Name and text of each file; the log is the last one."""
+    radius: float | None = None
+    """Radius of the points of Marlin's G33, or half the side of its grid, [m]."""
 
     @property
     def text(self) -> str:
@@ -106,24 +111,18 @@ class LogText:
         return f"{self.name}:{line + 1}"
 
 
-def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:
+def numbers(texts: Sequence[str], *, name: str, where: str | None = None) -> list[float]:
     """Parse texts as finite numbers.
 
     Args:
         texts: The texts.
-        where: File and line, for messages.
         name: Name of the numbers, for messages.
+        where: File and line, for messages.
 
     Raises:
         SessionError: If a text is not a finite number.
     """
     return [parse_number(t.strip(), where=where, name=name, error=SessionError) for t in texts]
-
-
-def average_samples(points: Array) -> Array:
-    """Average successive samples of the same place, shape (K, 3), [m]."""
-    begins = _place_begins(points)
-    return np.array([np.mean(group, axis=0) for group in np.split(points, begins[1:])])
 
 
 def _place_begins(points: Array) -> list[int]:
@@ -189,12 +188,11 @@ def _extends(probing: Array, other: Array) -> bool:
     return len(other) > len(probing) and all(map(_is_same_place, probing, other))
 
 
-def require_points(count: int, *, where: str, expected: str) -> None:
+def require_points(count: int, expected: str) -> None:
     """Refuse a log with too few or too many points.
 
     Args:
         count: Number of points.
-        where: Name of the log, for messages.
         expected: Description of a complete log, for the message.
 
     Raises:
@@ -203,8 +201,7 @@ def require_points(count: int, *, where: str, expected: str) -> None:
     if not MIN_POINTS <= count <= MAX_POINTS:
         number = count or "no"
         raise SessionError(
-            f"found {number} probed points; expected {MIN_POINTS} to {MAX_POINTS}: {expected}",
-            where=where,
+            f"found {number} probed points; expected {MIN_POINTS} to {MAX_POINTS}: {expected}"
         )
 
 
@@ -212,36 +209,31 @@ def probed_log(
     settings: DeltaSettings,
     nozzle: Array,
     *,
-    where: str,
     expected: str,
-    notes: Sequence[str] = (),
+    notes: Sequence[str],
 ) -> PrinterLog:
     """Log from positions of the nozzle at the triggers.
 
     Args:
         settings: The settings.
         nozzle: Positions in the firmware's coordinates, shape (K, 3), [m].
-        where: Name of the log, for messages.
         expected: Description of a complete log, for messages.
         notes: Notes on omitted and unusual content.
 
     Raises:
         SessionError: If the number of points is out of range, or a point is out of reach.
     """
-    require_points(len(nozzle), where=where, expected=expected)
+    require_points(len(nozzle), expected)
     if np.abs(nozzle).max() > LARGEST_COORDINATE:
         raise SessionError(
             f"found a point at {np.abs(nozzle).max() / MM:g} mm; expected at most "
-            f"{LARGEST_COORDINATE / MM:g} mm",
-            where=where,
+            f"{LARGEST_COORDINATE / MM:g} mm"
         )
-    settings.require_plausible(where=where)
-    points = average_samples(nozzle)
-    require_points(len(points), where=where, expected=expected)
-    try:
-        carriages = settings.inverse(points)
-    except SessionError as e:
-        raise SessionError(e.problem, where=where) from None
+    settings.require_plausible()
+    places = np.split(nozzle, _place_begins(nozzle)[1:])
+    points = np.array([samples.mean(axis=0) for samples in places])
+    require_points(len(points), expected)
+    carriages = settings.inverse(points)
     notes = (*notes, *unusual_content(settings, carriages))
     return PrinterLog(settings, carriages, np.zeros(len(points)), notes)
 
@@ -304,14 +296,55 @@ def last_words(text: str, pattern: str) -> dict[str, str]:
 
 
 def command_words(text: str, pattern: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Position of each line with a G-code command, and its letters and values."""
+    """Position of each line with a G-code command, and its letters and values.
+
+    Blanks need not separate the words.
+    """
+    words = re.compile(rf"(?<![A-Za-z])([A-Z]) ?({NUMBER}(?::{NUMBER})*)")
     for match in re.finditer(rf"^[^;\n]*?\b{pattern}(?![\d.])([^;\n]*)", text, re.MULTILINE):
-        yield match.start(1), read_words(match[1])
+        yield match.start(1), dict(words.findall(match[1]))
 
 
-def read_words(text: str) -> dict[str, str]:
-    """Letters and values of a G-code line, also if no blanks separate them."""
-    return dict(re.findall(rf"(?<![A-Za-z])([A-Z]) ?({NUMBER}(?::{NUMBER})*)", text))
+def write_words(letters: str, values: Array) -> str:
+    """Words of a G-code line."""
+    words = zip(letters, values + 0.0, strict=True)  # not -0.0
+    return " ".join(f"{letter}{value:.{DECIMALS}f}" for letter, value in words)
+
+
+def settings_of_m665(
+    firmware: FirmwareName,
+    m665: Mapping[str, str],
+    rods: Array,
+    stops: Array,
+    probe: Array,
+    *,
+    raised: float = 0.0,
+) -> DeltaSettings:
+    """Settings of the G-code command M665.
+
+    Args:
+        firmware: The firmware.
+        m665: Values of R and H, [mm], and of X, Y and Z, [°], by letter.
+        rods: Lengths of the rods, shape (3,), [mm].
+        stops: Heights of the endstops above H, shape (3,), [mm].
+        probe: Tip of the probe at the trigger, from the nozzle, shape (3,), [m].
+        raised: Height of the zero of H above that of the nozzle, [m].
+
+    Raises:
+        SessionError: If a value is no number, or the rods are too short.
+    """
+    radius, height = numbers([m665[k] for k in "RH"], name="M665")
+    turns = numbers([m665.get(k, "0") for k in "XYZ"], name="M665")
+    if not 0.0 < radius < rods.min():
+        raise SessionError(
+            f"M665 has R {radius:g} and rods from {rods.min():g}; expected a positive radius and "
+            "longer rods"
+        )
+    homed = (height + np.sqrt(rods**2 - radius**2) + stops) * MM - raised
+    angles = triple(DESIGN_ANGLES + np.array(turns) * DEG)
+    return DeltaSettings(
+        firmware, radius * MM, triple(rods, MM), triple(homed), angles, probe=triple(probe)
+    )
 
 
 def require_one_value(source: LogText, command: str, *, since: int = 0, until: int) -> None:

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.printers.log import (
+    DECIMALS,
     MIN_POINTS,
     NUMBER,
     LogText,
@@ -26,7 +27,9 @@ from orthocal.printers.log import (
     numbers,
     probed_log,
     require_one_value,
+    settings_of_m665,
     unstated_trigger,
+    write_words,
 )
 from orthocal.printers.settings import (
     DESIGN_ANGLES,
@@ -35,9 +38,6 @@ from orthocal.printers.settings import (
     FirmwareName,
 )
 from orthocal.units import DEG, MM
-
-DECIMALS = 4
-"""Decimals of settings."""
 
 EXPECTED = (
     "lines 'Bed X: Y: Z:' of G30 or G29 V4, the table of G33 V3, or a bilinear leveling grid; and "
@@ -88,26 +88,22 @@ class _Probing:
     notes: tuple[str, ...] = ()
 
 
-def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
+def read_log(source: LogText) -> PrinterLog:
     """Read settings and probed points.
-
-    Args:
-        source: The log and files with settings.
-        radius: Radius of the points of G33, or half the side of a grid, [m].
 
     Raises:
         SessionError: If the text is invalid; names the line or the missing setting.
     """
-    probing = _bed_points(source) or _table(source, radius) or _grid(source, radius)
-    text, where, notes = source.text, source.name, list(probing.notes)
+    probing = _bed_points(source) or _table(source) or _grid(source)
+    text, notes = source.text, list(probing.notes)
     if not probing.at_nozzle:  # G33 changes settings, and prints those of the probing
         for command in ("M665", "M666", "M851"):
             require_one_value(source, command, since=probing.since, until=probing.until)
     m665, m666, m851 = (
         last_words(text, k) | last_words(text[: probing.until], k) for k in ("M665", "M666", "M851")
     )
-    x, y, z = numbers([m851.get(k, "0") for k in "XYZ"], where=where, name="M851")
-    settings = _settings(m665, m666, probing.g33, np.array([x, y, z]) * MM, where)
+    x, y, z = numbers([m851.get(k, "0") for k in "XYZ"], name="M851")
+    settings = _settings(m665, m666, probing.g33, np.array([x, y, z]) * MM)
     if (bed := _calibration_radius(m665)) is not None:
         notes.append(
             f"M665 B{bed:g} is the radius at which G33 of Marlin 1.1 probes, not a trim of a rod."
@@ -117,20 +113,19 @@ def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
     nozzle = (
         probing.points - [0.0, 0.0, z] if probing.at_nozzle else probing.points - [x, y, z]
     ) * MM
-    return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
+    return probed_log(settings, nozzle, expected=EXPECTED, notes=notes)
 
 
-def read_log_1(source: LogText, *, radius: float | None = None) -> PrinterLog:
+def read_log_1(source: LogText) -> PrinterLog:
     """Read a log of Marlin 1.1 as `read_log` does.
 
     Raises:
         SessionError: If the settings have trims of rods, which Marlin 1.1 lacks, or as `read_log`.
     """
-    log = read_log(source, radius=radius)
+    log = read_log(source)
     if len(set(log.settings.rods)) > 1:
         raise SessionError(
-            "M665 has trims A, B, C of rods, which Marlin 1.1 lacks; expected --format marlin",
-            where=source.name,
+            "M665 has trims A, B, C of rods, which Marlin 1.1 lacks; expected --format marlin"
         )
     return replace(log, settings=replace(log.settings, firmware="marlin1"))
 
@@ -179,7 +174,6 @@ def _settings(
     m666: Mapping[str, str],
     g33: re.Match[str] | None,
     probe: Array,
-    where: str,
 ) -> DeltaSettings:
     """Settings of M665 and M666; different settings that G33 printed replace them."""
     firmware = _firmware(m665)
@@ -189,41 +183,23 @@ def _settings(
     printed = {} if g33 is None else {k: v for k, v in g33.groupdict().items() if v is not None}
     for name, value in printed.items():
         key = {"E": f"E{name[-1].upper()}", "T": name[-1].upper()}.get(name[0], name)
-        stated = numbers([value, words.get(key, value)], where=where, name=name)
+        stated = numbers([value, words.get(key, value)], name=name)
         if key not in words or abs(stated[0] - stated[1]) > ROUNDING_TOLERANCE:
             words[key] = value
     for letter in "LRH":
         if letter not in words:
             raise SessionError(
                 f"has no M665 {letter}; expected the settings that M503 prints, with "
-                "M665 L R H X Y Z, M666 X Y Z and M851",
-                where=where,
+                "M665 L R H X Y Z, M666 X Y Z and M851"
             )
-    rod, radius, height = numbers([words[k] for k in "LRH"], where=where, name="M665")
-    rods = rod + np.array(numbers([words[k] for k in "ABC"], where=where, name="M665"))
-    turns = np.array(numbers([words[k] for k in "XYZ"], where=where, name="M665"))
-    lowered = np.array(numbers([words[f"E{k}"] for k in "XYZ"], where=where, name="M666"))
-    if not 0.0 < radius < rods.min():
-        raise SessionError(
-            f"M665 has R {radius:g} and rods from {rods.min():g}; expected a positive radius and "
-            "longer rods",
-            where=where,
-        )
-    middle = np.sqrt(rods**2 - radius**2)
-    homed = (height + middle - lowered) * MM - probe[2]
-    angles = np.array(DESIGN_ANGLES) + turns * DEG
-    a, b, c = (rods * MM).tolist()
-    return DeltaSettings(
-        firmware,
-        radius * MM,
-        (a, b, c),
-        (homed[0].item(), homed[1].item(), homed[2].item()),
-        (angles[0].item(), angles[1].item(), angles[2].item()),
-        probe=(probe[0].item(), probe[1].item(), probe[2].item()),
+    rod, *trims = numbers([words[k] for k in "LABC"], name="M665")
+    lowered = np.array(numbers([words[f"E{k}"] for k in "XYZ"], name="M666"))
+    return settings_of_m665(
+        firmware, words, rod + np.array(trims), -lowered, probe, raised=probe[2]
     )
 
 
-def _table(source: LogText, radius: float | None) -> _Probing | None:
+def _table(source: LogText) -> _Probing | None:
     """First table of the last complete G33, which belongs to its first settings; None without any.
 
     Raises:
@@ -247,7 +223,7 @@ def _table(source: LogText, radius: float | None) -> _Probing | None:
             f"G33 P{averaged[1]} prints means over arcs, not points; expected G33 P3 V3, or G29 V4",
             where=source.place(commands[-1].start()),
         )
-    distance = _require_radius(text, radius, "G33")
+    distance = _require_radius(source, "G33")
     points = []
     for match in rows:
         line = source.place(match.start())
@@ -258,15 +234,15 @@ def _table(source: LogText, radius: float | None) -> _Probing | None:
     return _Probing(np.array(points), 0, g33.start(), g33, at_nozzle=True)
 
 
-def _require_radius(text: str, radius: float | None, table: str) -> float:
+def _require_radius(source: LogText, table: str) -> float:
     """Distance from the middle of the outermost points of a table, [mm].
 
     Raises:
         SessionError: If it is not stated.
     """
-    if radius is not None:
-        return radius / MM
-    bed = _calibration_radius(last_words(text, "M665"))
+    if source.radius is not None:
+        return source.radius / MM
+    bed = _calibration_radius(last_words(source.text, "M665"))
     hint = "DELTA_PRINTABLE_RADIUS minus the margin" if bed is None else f"M665 B: {bed:g} mm"
     raise SessionError(
         f"is missing; {table} does not state where it was probed: state the largest distance from "
@@ -275,7 +251,7 @@ def _require_radius(text: str, radius: float | None, table: str) -> float:
     )
 
 
-def _grid(source: LogText, radius: float | None) -> _Probing:
+def _grid(source: LogText) -> _Probing:
     """Points of the last bilinear grid within the radius; no points without a grid.
 
     Raises:
@@ -286,15 +262,12 @@ def _grid(source: LogText, radius: float | None) -> _Probing:
     if not grids:
         return _Probing(np.zeros((0, 3)), 0, len(text), _last_g33(text, len(text)))
     grid = grids[-1]
-    where = source.place(grid.start())
-    rows = [
-        numbers(line.split()[1:], where=where, name="grid")
-        for line in grid["rows"].splitlines()
-        if line.strip()
-    ]
-    if len({len(row) for row in rows}) != 1:
-        raise SessionError("has rows of different lengths; expected a complete grid", where=where)
-    distance, heights = _require_radius(text, radius, "the grid"), np.array(rows)
+    lines = [line.split()[1:] for line in grid["rows"].splitlines() if line.strip()]
+    with errors_at(source.place(grid.start())):
+        rows = [numbers(line, name="grid") for line in lines]
+        if len({len(row) for row in rows}) != 1:
+            raise SessionError("has rows of different lengths; expected a complete grid")
+    distance, heights = _require_radius(source, "the grid"), np.array(rows)
     y, x = np.meshgrid(*(np.linspace(-distance, distance, n) for n in heights.shape), indexing="ij")
     points = np.column_stack([x.ravel(), y.ravel(), heights.ravel()])
     within = np.hypot(points[:, 0], points[:, 1]) <= distance * (1.0 + 1e-9)
@@ -310,11 +283,8 @@ def config_lines(settings: DeltaSettings) -> str:
     height = (lowest + settings.probe[2]) / MM
     turns = (np.array(settings.angles) - DESIGN_ANGLES) / DEG
     lowered = (lowest - settings.endstops) / MM
-    trims = " ".join(f"{k}{v:.{n}f}" for k, v in zip("ABC", rods - rod + 0.0, strict=True))
-    turned = " ".join(f"{k}{v:.{n}f}" for k, v in zip("XYZ", turns + 0.0, strict=True))
-    stops = " ".join(f"{k}{v:.{n}f}" for k, v in zip("XYZ", lowered, strict=True))
-    trims = "" if settings.firmware == "marlin1" else f" {trims}"
+    trims = "" if settings.firmware == "marlin1" else f" {write_words('ABC', rods - rod)}"
     return (
-        f"M665 L{rod:.{n}f} R{settings.radius / MM:.{n}f} H{height:.{n}f} {turned}{trims}\n"
-        f"M666 {stops}\nM500\n"
+        f"M665 L{rod:.{n}f} R{settings.radius / MM:.{n}f} H{height:.{n}f} "
+        f"{write_words('XYZ', turns)}{trims}\nM666 {write_words('XYZ', lowered)}\nM500\n"
     )

@@ -7,27 +7,28 @@ src/Movement/Kinematics/LinearDeltaKinematics.cpp, src/Movement/BedProbing/Rando
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.printers.log import (
+    DECIMALS,
     NUMBER,
     LogText,
     PrinterLog,
+    command_words,
     last_words,
     numbers,
     probed_log,
-    read_words,
+    settings_of_m665,
     unstated_trigger,
+    write_words,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
-
-DECIMALS = 4
-"""Decimals of settings."""
 
 EXPECTED = (
     "the line 'bed probe heights:' that G30 or G32 with S-1 reports, and the lines 'G30 P X Y' of "
@@ -37,7 +38,6 @@ EXPECTED = (
 _HEIGHTS = re.compile(r"[Bb]ed probe heights:(?P<values>[^,\n]*), mean")
 _CALIBRATED = re.compile(r"Calibrated (\d+) factors using \d+ points")
 _STOPPED = re.compile(rf"Stopped at height {NUMBER} mm")
-_POINT = re.compile(r"^[^;\n]*?\bG30\b(?P<words>[^;\n]*)", re.MULTILINE)
 _M665 = re.compile(
     rf"Diagonals? (?P<L>{NUMBER}(?::{NUMBER})*), delta radius (?P<R>{NUMBER}), homed height "
     rf"(?P<H>{NUMBER}), bed radius {NUMBER}, X (?P<X>{NUMBER})[^,]*, Y (?P<Y>{NUMBER})[^,]*, "
@@ -54,24 +54,20 @@ def recognise(text: str) -> bool:
     return any(p.search(text) for p in (_HEIGHTS, _M665, _CALIBRATED, _STOPPED))
 
 
-def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
+def read_log(source: LogText) -> PrinterLog:
     """Read settings and probed points.
-
-    Args:
-        source: The log and files with settings and points.
-        radius: Not used.
 
     Raises:
         SessionError: If the text is invalid; names the line or the missing setting.
     """
-    del radius
-    text, where = source.text, source.name
+    text = source.text
     reports = list(_HEIGHTS.finditer(text))
     if not reports:
         _refuse_without_heights(source)
     report = reports[-1]
     line = source.place(report.start())
-    heights = _heights(report["values"], line)
+    with errors_at(line):
+        heights = _heights(report["values"])
     points = _points(source, report.start())
     if len(points) != len(heights):
         raise SessionError(
@@ -80,14 +76,14 @@ def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
             where=line,
         )
     g31 = last_words(text, "G31")
-    x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], where=where, name="G31")
+    x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], name="G31")
     nozzle = np.column_stack([points - [x, y], np.array(heights) + z]) * MM
     _require_settings_of(source, report.start())
-    settings = _settings(text, np.array([x, y, -z]) * MM, where)
+    settings = _settings(text, np.array([x, y, -z]) * MM)
     notes = [] if "Z" in g31 else [unstated_trigger("G31 Z")]
     if len(reports) > 1:
         notes.append(f"The log has {len(reports)} probings. The last one is used: {line}.")
-    return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
+    return probed_log(settings, nozzle, expected=EXPECTED, notes=notes)
 
 
 def _refuse_without_heights(source: LogText) -> NoReturn:
@@ -110,10 +106,10 @@ def _refuse_without_heights(source: LogText) -> NoReturn:
             f"found '{stopped[0]}' of a G30 without P, which states no place; expected {EXPECTED}",
             where=source.place(stopped.start()),
         )
-    raise SessionError(f"found no probed points; expected {EXPECTED}", where=source.name)
+    raise SessionError(f"found no probed points; expected {EXPECTED}")
 
 
-def _heights(text: str, where: str) -> list[float]:
+def _heights(text: str) -> list[float]:
     """Heights of a report, [mm].
 
     Raises:
@@ -122,10 +118,8 @@ def _heights(text: str, where: str) -> list[float]:
     words = re.findall(r"not set|probing failed|\S+", text)
     for number, word in enumerate(words):
         if word in ("not set", "probing failed"):
-            raise SessionError(
-                f"point P{number} has '{word}' in place of a height; probe again", where=where
-            )
-    return numbers(words, where=where, name="a bed probe height")
+            raise SessionError(f"point P{number} has '{word}' in place of a height; probe again")
+    return numbers(words, name="a bed probe height")
 
 
 def _require_settings_of(source: LogText, report: int) -> None:
@@ -139,19 +133,16 @@ def _require_settings_of(source: LogText, report: int) -> None:
         SessionError: Naming the line of the calibration.
     """
     text = source.text
-    stated = [m.start() for pattern in (_M665, _M666) for m in pattern.finditer(text)]
+    stated = [[m.start() for m in pattern.finditer(text)] for pattern in (_M665, _M666)]
     for match in _CALIBRATED.finditer(text):
         place, at = source.place(match.start()), match.start()
-        if at > report and any(p > at for p in stated):
+        if at > report and any(p > at for positions in stated for p in positions):
             raise SessionError(
                 "changed the settings after the heights, and M665 or M666 reported the new ones; "
                 "expected only the settings during the probing",
                 where=place,
             )
-        reported = all(
-            any(at < m.start() < report for m in pattern.finditer(text))
-            for pattern in (_M665, _M666)
-        )
+        reported = all(any(at < p < report for p in positions) for positions in stated)
         if at < report and not reported:
             raise SessionError(
                 "changed the settings before the heights; expected the answers of M665 and M666 "
@@ -166,11 +157,10 @@ def _points(source: LogText, report: int) -> Array:
     The commands before the report count, all commands if there are none. P0 begins a new list.
     """
     places: dict[float, tuple[float, float]] = {}
-    matches = list(_POINT.finditer(source.text))
-    for match in [m for m in matches if m.start() < report] or matches:
-        words = read_words(match["words"])
+    commands = list(command_words(source.text, "G30"))
+    for position, words in [c for c in commands if c[0] < report] or commands:
         if {"P", "X", "Y"} <= words.keys():
-            line = source.place(match.start())
+            line = source.place(position)
             number, x, y = numbers([words[k] for k in "PXY"], where=line, name="G30")
             if number == 0.0:
                 places = {}
@@ -178,7 +168,7 @@ def _points(source: LogText, report: int) -> Array:
     return np.array([places[k] for k in sorted(places)]).reshape(-1, 2)
 
 
-def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
+def _settings(text: str, probe: Array) -> DeltaSettings:
     """Settings of commands; reports of M665 and M666 replace them."""
     m665, m666 = last_words(text, "M665"), last_words(text, "M666")
     for words, pattern in ((m665, _M665), (m666, _M666)):
@@ -188,45 +178,24 @@ def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
         if letter not in m665:
             raise SessionError(
                 f"has no M665 {letter}; expected M665 L R H of config.g or config-override.g "
-                "(--settings), or the report of M665 without parameters",
-                where=where,
+                "(--settings), or the report of M665 without parameters"
             )
-    rods = numbers(m665["L"].split(":"), where=where, name="M665 L")
+    rods = numbers(m665["L"].split(":"), name="M665 L")
     rods = rods if len(rods) == 3 else [rods[0]] * 3
-    radius, height = numbers([m665[k] for k in "RH"], where=where, name="M665")
-    turns = numbers([m665.get(k, "0") for k in "XYZ"], where=where, name="M665")
-    stops = numbers([m666.get(k, "0") for k in "XYZ"], where=where, name="M666")
-    tilts = numbers([m666.get(k, "0") for k in "AB"], where=where, name="M666")
-    if not 0.0 < radius < min(rods):
-        raise SessionError(
-            f"M665 has R {radius:g} and rods from {min(rods):g}; expected a positive radius and "
-            "longer rods",
-            where=where,
-        )
-    homed = height + np.sqrt(np.array(rods) ** 2 - radius**2) + stops
-    a, b, c = (np.array(DESIGN_ANGLES) + np.array(turns) * DEG).tolist()
-    return DeltaSettings(
-        "reprapfirmware",
-        radius * MM,
-        (rods[0] * MM, rods[1] * MM, rods[2] * MM),
-        (homed[0].item() * MM, homed[1].item() * MM, homed[2].item() * MM),
-        (a, b, c),
-        (tilts[0] / 100.0, tilts[1] / 100.0),
-        (probe[0].item(), probe[1].item(), probe[2].item()),
-    )
+    stops = numbers([m666.get(k, "0") for k in "XYZ"], name="M666")
+    a, b = numbers([m666.get(k, "0") for k in "AB"], name="M666")
+    settings = settings_of_m665("reprapfirmware", m665, np.array(rods), np.array(stops), probe)
+    return replace(settings, tilts=(a / 100.0, b / 100.0))
 
 
 def config_lines(settings: DeltaSettings) -> str:
     """Lines of config.g, and of config-override.g if M501 reads it."""
     n, height = DECIMALS, float(settings.endstops.mean())
     rods = ":".join(f"{v / MM:.{n}f}" for v in settings.rods)
-    turns = (np.array(settings.angles) - DESIGN_ANGLES) / DEG + 0.0
-    turned = " ".join(f"{k}{v:.{n}f}" for k, v in zip("XYZ", turns, strict=True))
-    stops = " ".join(
-        f"{k}{v:.{n}f}" for k, v in zip("XYZ", (settings.endstops - height) / MM, strict=True)
-    )
-    a, b = (100.0 * v for v in settings.tilts)
+    turns = (np.array(settings.angles) - DESIGN_ANGLES) / DEG
+    stops = write_words("XYZ", (settings.endstops - height) / MM)
+    tilts = write_words("AB", 100.0 * np.array(settings.tilts))
     return (
-        f"M665 L{rods} R{settings.radius / MM:.{n}f} H{height / MM:.{n}f} {turned}\n"
-        f"M666 {stops} A{a:.{n}f} B{b:.{n}f}\n"
+        f"M665 L{rods} R{settings.radius / MM:.{n}f} H{height / MM:.{n}f} "
+        f"{write_words('XYZ', turns)}\nM666 {stops} {tilts}\n"
     )

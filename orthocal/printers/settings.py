@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number
 from orthocal.io.fields import FileRecord
@@ -94,8 +94,8 @@ class DeltaSettings(FileRecord):
 
     def moved(self, change: Array) -> DeltaSettings:
         """Same settings with coordinates of the carriages that differ by `change`, (3,), [m]."""
-        homed, shift = np.array(self.homed) + change, np.array(self.shift) + change
-        return replace(self, homed=tuple(homed.tolist()), shift=tuple(shift.tolist()))
+        homed, shift = triple(change + self.homed), triple(change + self.shift)
+        return replace(self, homed=homed, shift=shift)
 
     def inverse(self, points: ArrayLike) -> Array:
         """Coordinates of the carriages at nozzle positions (K, 3), shape (K, 3), [m].
@@ -139,17 +139,14 @@ class DeltaSettings(FileRecord):
         """Positions of the probe's tip at coordinates of the carriages (K, 3), (K, 3), [m]."""
         return np.asarray(self.forward(carriages) + self.probe)
 
-    def require_plausible(self, *, where: str) -> None:
+    def require_plausible(self) -> None:
         """Refuse implausible settings, such as the result of a failed fit.
-
-        Args:
-            where: Name of the file, for messages.
 
         Raises:
             SessionError: If a setting is implausible; names it.
         """
         if problem := self.find_problem():
-            raise SessionError(problem, where=where)
+            raise SessionError(problem)
 
     def find_problem(self) -> str:
         """First implausible setting, and what is expected; empty if all are plausible."""

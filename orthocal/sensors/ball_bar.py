@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 from pydantic import Field
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.io.documents import Name, Number
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import SCALE, ScaleTolerance
@@ -35,7 +35,6 @@ from orthocal.sensors.protocol import (
     ToolSensor,
     View,
     place_point,
-    triple,
 )
 from orthocal.units import MM, read_tolerance, show_mm, show_tolerance, to_mm
 

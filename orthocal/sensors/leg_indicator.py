@@ -25,7 +25,7 @@ import casadi as ca
 import numpy as np
 from pydantic import Field, field_validator
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Name, Number, OneKey
 from orthocal.robot.model import Leg, Robot
@@ -46,7 +46,6 @@ from orthocal.sensors.protocol import (
     SetupKeys,
     TouchingTip,
     View,
-    triple,
 )
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM, show_mm, to_mm

@@ -27,7 +27,7 @@ import numpy as np
 import pinocchio as pin
 from pydantic import Field
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Triple, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number
 from orthocal.robot.model import Robot
@@ -38,10 +38,8 @@ from orthocal.sensors.protocol import (
     NuisanceParameter,
     SetupKeys,
     ToolSensor,
-    Triple,
     View,
     place_point,
-    triple,
 )
 from orthocal.units import MM, MRAD, UM, read_tolerance, show_mm, show_tolerance, tidy, to_mm
 

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Literal
 import casadi as ca
 from pydantic import Field
 
+from orthocal.arrays import Triple, triple
 from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
 from orthocal.sensors.direction import direction_vector
@@ -27,9 +28,7 @@ from orthocal.sensors.protocol import (
     GaugeZero,
     NuisanceParameter,
     SetupKeys,
-    Triple,
     View,
-    triple,
 )
 from orthocal.sensors.tool_indicator import (
     ALIGNMENT_STD,

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from orthocal.arguments import require_names
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Triple
 from orthocal.effects.protocol import Condition
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name
@@ -47,15 +47,6 @@ usual errors of a machine before the calibration."""
 
 LARGEST_READING = 0.3
 """Largest reading of an indicator, [m]; no leg is as far from parallel."""
-
-
-Triple = tuple[float, float, float]
-
-
-def triple(values: Sequence[float] | Array, unit: float = 1.0) -> Triple:
-    """Three numbers in a unit, in SI."""
-    x, y, z = (float(v) * unit + 0.0 for v in values)
-    return x, y, z
 
 
 @dataclass(frozen=True, slots=True)

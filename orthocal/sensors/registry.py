@@ -10,12 +10,13 @@ its object is the class:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import PlainSerializer, PlainValidator
 
 from orthocal.arguments import require_kind
 from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
-from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
 from orthocal.sensors.protocol import Sensor, SetupKeys
 
@@ -114,5 +115,5 @@ def _read_recorded(data: object) -> Sensor:
         raise ValueError(f"{(e.where or '').strip(' :.')}|{e.problem}") from None
 
 
-RECORDED = As(_read_recorded, write_sensor)
+RecordedSensor = Annotated[Sensor, PlainValidator(_read_recorded), PlainSerializer(write_sensor)]
 """Field type of a sensor in a record."""

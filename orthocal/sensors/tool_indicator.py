@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 from pydantic import Field
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
@@ -43,7 +43,6 @@ from orthocal.sensors.protocol import (
     View,
     default_zero,
     place_point,
-    triple,
 )
 from orthocal.units import MM, MRAD, read_tolerance, show_mm, show_tolerance, to_mm
 

@@ -10,20 +10,12 @@ from typing import get_args
 import numpy as np
 
 from orthocal.effects.adjustment import require_adjustment
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import MOST_SHOWN
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.sensors.protocol import GaugeZero
 from orthocal.session.differences import IndependentReadings
-from orthocal.session.session import (
-    Conditions,
-    Gauge,
-    Posture,
-    Reading,
-    ReadingKey,
-    Session,
-    Setup,
-)
+from orthocal.session.session import Conditions, Gauge, Posture, Reading, ReadingKey, Session, Setup
 from orthocal.text import list_some
 
 
@@ -64,7 +56,7 @@ def _require_named(parts: object, kind: type, where: str) -> None:
             raise SessionError(f"has the name '{part.name}'", where=f"{where}.{name}")
 
 
-def _require_kind(value: object, kind: type, where: str) -> None:
+def _require_kind(value: object, kind: type, where: str | None = None) -> None:
     if not isinstance(value, kind):
         found, expected = type(value).__name__, kind.__name__
         raise SessionError(f"found a {found}; expected a {expected}", where=where)
@@ -127,25 +119,18 @@ def _require_readings(session: Session) -> None:
         require_name(r.setup, session.setups, "setup", where="readings")
         for posture in (r.posture, *([] if r.minus is None else [r.minus])):
             require_name(posture, session.postures, "posture", where="readings")
-        if not isinstance(r.value, Real) or math.isinf(r.value):
-            raise SessionError(
-                f"found {r.value!r}; expected a finite number, in m", where=session.where(r)
-            )
-        if not isinstance(r.cycle, Integral) or r.cycle < 1:
-            raise SessionError(
-                f"found the cycle {r.cycle!r}; expected a whole number from 1",
-                where=session.where(r),
-            )
-        if r.conditions is not None:
-            _require_conditions(session, r, r.conditions, zoned)
-        if r.key in keys:
-            raise SessionError(
-                f"repeats cycle {r.cycle}; count the repetitions: cycle 1, 2, …",
-                where=session.where(r),
-            )
-        keys.add(r.key)
-        if r.minus is None or session.is_difference(r):
-            independent.add(r, session.where(r))
+        with errors_at(session.where(r)):
+            if not isinstance(r.value, Real) or math.isinf(r.value):
+                raise SessionError(f"found {r.value!r}; expected a finite number, in m")
+            if not isinstance(r.cycle, Integral) or r.cycle < 1:
+                raise SessionError(f"found the cycle {r.cycle!r}; expected a whole number from 1")
+            if r.conditions is not None:
+                _require_conditions(session, r, r.conditions, zoned)
+            if r.key in keys:
+                raise SessionError(f"repeats cycle {r.cycle}; count the repetitions: cycle 1, 2, …")
+            keys.add(r.key)
+            if r.minus is None or session.is_difference(r):
+                independent.add(r)
     missing = sum(not r.is_read for r in session.readings)
     if missing:
         count = len(session.readings)
@@ -166,27 +151,24 @@ def _require_conditions(
         conditions: Its conditions.
         zoned: Setups, mapped to whether their times have a time zone. A first time is added.
     """
-    where = session.where(reading)
-    _require_kind(conditions, Conditions, where)
+    _require_kind(conditions, Conditions)
     approach, time = conditions.approach, conditions.time
     if approach is not None and (problem := find_approach_problem(approach, session.robot)):
-        raise SessionError(f"approach: found {problem}", where=where)
+        raise SessionError(f"approach: found {problem}")
     if not math.isfinite(conditions.temperature or 0.0):
         raise SessionError(
-            f"temperature: found {conditions.temperature}; expected a finite number, in °C",
-            where=where,
+            f"temperature: found {conditions.temperature}; expected a finite number, in °C"
         )
     if time is not None:
         has_zone = time.tzinfo is not None
         if zoned.setdefault(reading.setup, has_zone) != has_zone:
             raise SessionError(
                 f"time: found {time}; expected all times of setup '{reading.setup}' with a time "
-                "zone, or all without one",
-                where=where,
+                "zone, or all without one"
             )
 
 
-def require_name(name: str, known: Collection[str], noun: str, *, where: str) -> None:
+def require_name(name: str, known: Collection[str], noun: str, *, where: str | None = None) -> None:
     """Refuse an unknown name of a setup, a posture or a gauge.
 
     Raises:

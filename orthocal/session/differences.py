@@ -17,12 +17,8 @@ class IndependentReadings:
         self._relative: set[tuple[str, int]] = set()
         self._leaders: dict[Node, Node] = {}
 
-    def add(self, reading: Reading, where: str) -> None:
+    def add(self, reading: Reading) -> None:
         """Add a reading of a posture, or a difference; not one of a pair of postures.
-
-        Args:
-            reading: The reading.
-            where: File and line, for messages.
 
         Raises:
             SessionError: If it is a linear combination of previous differences, or if its cycle
@@ -37,14 +33,12 @@ class IndependentReadings:
                 raise SessionError(
                     f"{reading.label} follows from the other differences of setup "
                     f"{reading.setup} in cycle {reading.cycle}; delete it, or use another cycle "
-                    "if it was measured separately",
-                    where=where,
+                    "if it was measured separately"
                 )
         if group in self._absolute and group in self._relative:
             raise SessionError(
                 f"setup {reading.setup} has both readings and differences in cycle "
-                f"{reading.cycle}; keep the readings only",
-                where=where,
+                f"{reading.cycle}; keep the readings only"
             )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from orthocal.arguments import require_array
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Triple
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import with_effects
 from orthocal.errors import SessionError
@@ -27,7 +27,7 @@ from orthocal.io.fields import FileRecord, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import GaugeZero, Sensor, Triple, is_difference
+from orthocal.sensors.protocol import GaugeZero, Sensor, is_difference
 from orthocal.units import MM
 
 DISTANCE_DECIMALS = 9
@@ -488,6 +488,8 @@ class Session:
     def on_printer(self, robot: Robot, homed: ArrayLike) -> Session:
         """Session of a printer in the coordinates of its robot before settings changed.
 
+        A session without settings is returned unchanged.
+
         Settings change the nominal dimensions and the coordinates of the homed carriages, but not
         the travel of the carriages below their endstops. Stated tolerances and effects of the
         session stay.
@@ -495,14 +497,9 @@ class Session:
         Args:
             robot: Robot with other nominal dimensions.
             homed: Coordinates of its homed carriages, shape (3,), [m].
-
-        Raises:
-            SessionError: If the session states no settings of a firmware.
         """
         if self.firmware is None:
-            raise SessionError(
-                "states no settings of a firmware", where=str(self.path or "session")
-            )
+            return self
         change = np.asarray(homed, dtype=np.float64) - self.firmware.homed
         drives = {name: read_only(p.drives + change) for name, p in self.postures.items()}
         plain = replace(robot, parameters=robot.parameters.defaults)

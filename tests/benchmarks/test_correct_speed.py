@@ -32,8 +32,8 @@ def test_programs_are_corrected_faster_than_the_machine_is_asked(
     text += [f"G1 X{x:.4f} Y{y:.4f} Z{z:.4f}\n" for x, y, z in points]
 
     def correct():
-        interpreter = Interpreter("p", axes=field.axes, offsets={})
-        corrector = ProgramCorrector(interpreter, field, within=1e-6)
+        interpreter = Interpreter(axes=field.axes, offsets={})
+        corrector = ProgramCorrector(interpreter, field, file="p.ngc", within=1e-6)
         return sum(1 for _ in corrector.run(text))
 
     def ask():

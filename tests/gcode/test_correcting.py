@@ -48,10 +48,10 @@ class Bent:
 def corrected(
     text, *, within=WITHIN, offsets=None, start=None, correct=None, one_tool=False, region=None
 ):
-    interpreter = Interpreter(
-        "p.ngc", axes=(0, 1, 2), offsets=offsets or {}, start=start, one_tool=one_tool
+    interpreter = Interpreter(axes=(0, 1, 2), offsets=offsets or {}, start=start, one_tool=one_tool)
+    corrector = ProgramCorrector(
+        interpreter, correct or Bent(), file="p.ngc", within=within, region=region
     )
-    corrector = ProgramCorrector(interpreter, correct or Bent(), within=within, region=region)
     lines = "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
     return lines, corrector.summary
 
@@ -376,8 +376,12 @@ def test_a_rapid_motion_to_a_safe_height_may_come_first():
         found = [float(re.search(rf"{k}(-?[\d.]+)", line)[1]) for k in "XYZ"]
         assert found == pytest.approx(bend([point])[0], abs=1e-3)
     assert lines[3].endswith("(over)")
-    interpreter = Interpreter("p.ngc", axes=(0, 1, 2), offsets={})
-    list(ProgramCorrector(interpreter, Bent(), within=WITHIN).run(f"{t}\n" for t in text))
+    interpreter = Interpreter(axes=(0, 1, 2), offsets={})
+    list(
+        ProgramCorrector(interpreter, Bent(), file="p.ngc", within=WITHIN).run(
+            f"{t}\n" for t in text
+        )
+    )
     assert interpreter.uncorrected == 2
     both, summary = corrected(["G21 G90", "G0 Z20", "X1 Y2"], start=(0.0, 0.0, 0.0))
     assert (len(both), summary.motions) == (3, 2)
@@ -412,8 +416,8 @@ def test_memory_does_not_grow_with_the_program(monkeypatch):
 
     peaks = []
     for count in (300, 3000):
-        interpreter = Interpreter("p", axes=(0, 1, 2), offsets={})
-        corrector = ProgramCorrector(interpreter, Bent(), within=WITHIN)
+        interpreter = Interpreter(axes=(0, 1, 2), offsets={})
+        corrector = ProgramCorrector(interpreter, Bent(), file="p.ngc", within=WITHIN)
         tracemalloc.start()
         for _ in corrector.run(lines(count)):
             pass
@@ -498,8 +502,8 @@ def test_longest_written_line_is_what_linuxcnc_reads(line, end, tmp_path, monkey
     from orthocal.gcode import program
 
     def written(fill):
-        interpreter = Interpreter("p.ngc", axes=(0, 1, 2), offsets={})
-        corrector = ProgramCorrector(interpreter, Bent(), within=WITHIN)
+        interpreter = Interpreter(axes=(0, 1, 2), offsets={})
+        corrector = ProgramCorrector(interpreter, Bent(), file="p.ngc", within=WITHIN)
         text = "".join(corrector.run(f"{t}{end}" for t in [*HEAD, line % fill, "M2"]))
         return text, max(len(part.encode()) for part in text.split("\n"))
 
@@ -530,7 +534,6 @@ def test_a_full_circle_may_end_a_rounding_error_beside_its_start(clockwise, turn
         clockwise=clockwise,
         plane=17,
         turns=turns,
-        where="",
     )
     assert arc.sweep == pytest.approx((-1 if clockwise else 1) * turns * 2.0 * np.pi)
     short = arc_about(
@@ -540,6 +543,5 @@ def test_a_full_circle_may_end_a_rounding_error_beside_its_start(clockwise, turn
         clockwise=clockwise,
         plane=17,
         turns=1,
-        where="",
     )
     assert abs(short.sweep) == pytest.approx(2e-4, rel=1e-6)

@@ -68,7 +68,7 @@ def test_many_values_are_refused(refused):
 
 def test_a_csv_with_too_many_rows_is_refused():
     lines = ["a,b\n", *["1,2\n"] * 1000]
-    rows = csv_rows(lines, name="f", required=("a", "b"), error=SessionError, most=1000)
+    rows = csv_rows(lines, name="f", required=("a", "b"), most=1000)
     with pytest.raises(SessionError, match="has more than 1000 rows"):
         list(rows)
 

@@ -21,8 +21,8 @@ from orthocal.measurement import recording as module
 from orthocal.measurement.files import session_file
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.recorded_rows import NextConditions
 from orthocal.measurement.recording import SUFFIX, open_recording
-from orthocal.measurement.recording_journal import NextConditions
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.session.session import Conditions
 from orthocal.units import MM

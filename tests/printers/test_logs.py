@@ -290,6 +290,15 @@ def test_what_is_refused_is_named(probed, text, where, found):
     assert found in raised.value.problem
 
 
+def test_a_wrong_probe_is_sought_in_the_file_with_settings(tmp_path):
+    log, settings = tmp_path / "log.txt", tmp_path / "printer.cfg"
+    settings.write_text(write_settings("klipper", odd()) + "[probe]\nz_offset: x\n")
+    log.write_text("probe at 0.0,0.0 is z=1.25\n" * 3)
+    with pytest.raises(SessionError) as raised:
+        import_printer_log(log, settings=[settings])
+    assert "printer.cfg" in str(raised.value.where)
+
+
 def test_lines_that_a_host_received(probed):
     """With and without a time, as terminal and log of a host show them."""
     plain = probed(MARLIN)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from orthocal.errors import SessionError
+from orthocal.measurement.files.session_drives import _read_posture
 from orthocal.measurement.files.session_keys import PostureKeys
-from orthocal.measurement.files.session_postures import _read_posture
 
 
 def advice(robot, key):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined, lines_in_fi
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
-from orthocal.measurement.files.session_keys import BACKLASH_KEYS, OFFSET_KEYS, keys_for_unit
+from orthocal.measurement.files.session_keys import Quantity, drive_value_keys
 from orthocal.printers.settings import FirmwareName
 from orthocal.session.session import Reading, Session, split_label
 from orthocal.text import quote_path, spans
-from orthocal.units import MM, Unit, format_fixed, trim_zeros
+from orthocal.units import MM, format_fixed, trim_zeros
 
 ACTIVE_SETTINGS: dict[FirmwareName, str] = {
     "klipper": "printer.cfg, and its part SAVE_CONFIG that takes precedence,",
@@ -171,10 +171,8 @@ def advise_about_sessions(session: Session, e: Explanation) -> str:
     ):
         return _advise_other_number(session, e)
     if e.kind != "machine changed":
-        number, keys = "offsets", OFFSET_KEYS
-        if e.kind.startswith("backlash"):
-            number, keys = "backlash", BACKLASH_KEYS
-        key = _name_keys(session, keys, e)
+        number: Quantity = "backlash" if e.kind.startswith("backlash") else "offsets"
+        key = _name_keys(session, number, e)
         which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
         note = f" {OFFSETS_IN_LINUXCNC}" if number == "offsets" else ""
         if e.kind in ("backlash halved", "backlash entered twice"):
@@ -222,29 +220,30 @@ def _advise_about_logs(session: Session, firmware: FirmwareName, e: Explanation)
     )
 
 
-def _name_keys(session: Session, keys: Mapping[str, tuple[Unit, float]], e: Explanation) -> str:
+def _name_keys(session: Session, quantity: Quantity, e: Explanation) -> str:
     """Keys of a session.yaml that may state the offsets or backlashes of the drives of an anomaly.
 
     Args:
         session: The session.
-        keys: OFFSET_KEYS or BACKLASH_KEYS.
+        quantity: Offsets or backlash.
         e: The anomaly; without drives it concerns all of them.
     """
     units = dict.fromkeys(
         d.unit for d in session.robot.drives if d.name in e.drives or not e.drives
     )
-    names = [f"`controller.{key}`" for unit in units for key in keys_for_unit(keys, unit)]
+    names = [f"`controller.{key}`" for unit in units for key in drive_value_keys(quantity, unit)]
     return joined(names, "or")
 
 
 def _advise_other_number(session: Session, e: Explanation) -> str:
     """Action after a drive that changed, or has another number in the controller than stated."""
-    number, keys, changed = "offsets", OFFSET_KEYS, "the drive or its home switch has moved"
+    number: Quantity = "offsets"
+    changed = "the drive or its home switch has moved"
     if is_backlash(e):
-        number, keys, changed = "backlash", BACKLASH_KEYS, "the drive has changed"
+        number, changed = "backlash", "the drive has changed"
     note = f"{OFFSETS_IN_LINUXCNC} " if number == "offsets" else ""
     return (
-        f"Compare the {number} in the controller with {_name_keys(session, keys, e)} of session "
+        f"Compare the {number} in the controller with {_name_keys(session, number, e)} of session "
         f"{e.sessions[0]}. {note}If they differ, state there those that were in the controller, "
         f"and calibrate again. If they agree, {changed}: {_calibrate_present(session, e)}, and "
         f"enter its {number}."

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import codecs
-import csv
 import itertools
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import (
-    BLANK,
-    MOST_CELLS,
-    MOST_COLUMNS,
-    MOST_ROWS,
-    Cell,
-    Row,
-    make_row,
-)
+from orthocal.io.documents import csv_cells
+from orthocal.io.tables.cell import BLANK, MOST_CELLS, MOST_COLUMNS, MOST_ROWS, Cell, Row, make_row
 from orthocal.text import shorten
 
 LARGEST_TEXT = 16 * 2**20
@@ -242,29 +234,19 @@ def split_rows(text: str, separator: str, *, where: str) -> Iterator[Row]:
                 )
             yield line[0]
 
-    reader = csv.reader(
-        lines(), delimiter=SEPARATORS[separator], skipinitialspace=True, strict=True
-    )
     count = 0
     first_line = 2 if stated_separator(text) is not None else 1
-    try:
-        for fields in reader:
-            line, length = reader.line_num, 0
-            if line > MOST_ROWS:
-                raise SessionError(f"has more than {MOST_ROWS} rows", where=where)
-            if len(fields) > MOST_COLUMNS:
-                raise SessionError(
-                    f"has {len(fields)} columns; expected at most {MOST_COLUMNS}",
-                    where=f"{where}:{line}",
-                )
-            if line < first_line:
-                continue
-            row = make_row(line, [Cell(field) if field else BLANK for field in fields])
-            if row is None:
-                continue
-            count += len(row.cells)
-            if count > MOST_CELLS:
-                raise SessionError(f"has more than {MOST_CELLS} cells", where=where)
-            yield row
-    except csv.Error as e:
-        raise SessionError(f"is not valid CSV: {e}", where=f"{where}:{reader.line_num}") from None
+    for line, fields in csv_cells(lines(), SEPARATORS[separator], name=where, most=MOST_ROWS):
+        length = 0
+        if len(fields) > MOST_COLUMNS:
+            raise SessionError(
+                f"has {len(fields)} columns; expected at most {MOST_COLUMNS}",
+                where=f"{where}:{line}",
+            )
+        row = make_row(line, [Cell(field) if field else BLANK for field in fields])
+        if line < first_line or row is None:
+            continue
+        count += len(row.cells)
+        if count > MOST_CELLS:
+            raise SessionError(f"has more than {MOST_CELLS} cells", where=where)
+        yield row

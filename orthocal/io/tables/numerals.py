@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from typing import Literal
 
 import numpy as np
@@ -81,26 +81,20 @@ def is_missing(text: str) -> bool:
 
 def parse_numeral(text: str, sign: Sign) -> Decimal | None:
     """Exact value of a numeral with a decimal sign; None if it is not a number."""
-    text = plain_minus(tidy_text(text))
+    # an apostrophe marks a number as text in spreadsheet programs
+    text = plain_minus(tidy_text(text)).removeprefix("'")
     if len(text) > LONGEST_NUMBER:
         return None
-    if text.startswith("'"):  # marks a number as text in spreadsheet programs
-        text = text[1:]
     match = _PATTERNS[sign].fullmatch(text)
     if not match:
         return None
     integer = re.sub("[^0-9]", "", match["integer"] or "")
     fraction = match["fraction"] or match["only"] or ""
-    try:
-        return Decimal(f"{match['sign']}{integer or '0'}.{fraction or '0'}e{match['power'] or '0'}")
-    except InvalidOperation:
-        return None
+    return Decimal(f"{match['sign']}{integer or '0'}.{fraction or '0'}e{match['power'] or '0'}")
 
 
-def format_decimal(value: Decimal | None) -> str:
+def format_decimal(value: Decimal) -> str:
     """Plain decimal notation without trailing zeros; exponents beyond ±30 keep their form."""
-    if value is None:
-        return "no number"
     text = f"{value:f}" if -30 < value.adjusted() < 30 else f"{value:e}"
     return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
 
@@ -122,39 +116,58 @@ class DecimalSign:
     """First numeral that determines the sign; None if the sign is stated, or not needed."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnknownSign:
-    """Numerals of a table that contradict each other, or are ambiguous."""
-
-    rival: Numeral
-    """First numeral with the rarer sign, or first ambiguous one."""
-    evidence: Numeral | None
-    """First numeral with the other sign; None if no numeral determines the sign."""
-
-
-def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign | UnknownSign:
-    """Infer the common decimal sign of the numerals of a table.
+def decide_decimal_sign(
+    numerals: Iterable[Numeral], *, standard: bool, advice: str, place: Callable[[int], str]
+) -> DecimalSign:
+    """Common decimal sign (point or comma) of the numerals of a table.
 
     A numeral that is a number with one of the signs only determines the sign of the table. Integers
     have no sign.
+
+    Args:
+        numerals: The numerals.
+        standard: Whether the headings are those of a readings.csv; then a point is a decimal point.
+        advice: Action for the user in case of an ambiguous sign.
+        place: Function from a line to file and line, for messages.
+
+    Raises:
+        SessionError: If both signs are possible, or both occur.
     """
     evidence: dict[Sign, list[Numeral]] = {}
-    ambiguous: Numeral | None = None
+    ambiguous: list[tuple[Numeral, Decimal, Decimal]] = []
     for numeral in numerals:
         point, comma = parse_numeral(numeral.text, "point"), parse_numeral(numeral.text, "comma")
-        if point is None and comma is not None:
-            evidence.setdefault("comma", []).append(numeral)
-        elif comma is None and point is not None:
-            evidence.setdefault("point", []).append(numeral)
-        elif point != comma and ambiguous is None:
-            ambiguous = numeral
+        if point == comma:
+            continue
+        if point is not None and comma is not None:
+            ambiguous.append((numeral, comma, point))
+        else:
+            evidence.setdefault("comma" if point is None else "point", []).append(numeral)
+    if standard:
+        points = [numeral for numeral, *_ in ambiguous if "," not in numeral.text]
+        ambiguous = [values for values in ambiguous if "," in values[0].text]
+        if points and "comma" in evidence:
+            evidence.setdefault("point", points)
     if len(evidence) == 2:
         # of equally frequent signs, the second one is the rival
-        frequent, rare = sorted(evidence.values(), key=len, reverse=True)
-        return UnknownSign(rare[0], frequent[0])
+        frequent, rare = sorted(evidence, key=lambda sign: len(evidence[sign]), reverse=True)
+        rival, other = evidence[rare][0], evidence[frequent][0]
+        raise SessionError(
+            f"the reading '{shorten(rival.text)}' has a decimal {rare}, and "
+            f"'{shorten(other.text)}' in line {other.line} a decimal {frequent}; use one decimal "
+            "sign",
+            where=place(rival.line),
+        )
     for sign, same in evidence.items():
         return DecimalSign(sign, same[0])
-    return DecimalSign("point", None) if ambiguous is None else UnknownSign(ambiguous, None)
+    if not ambiguous:
+        return DecimalSign("point", None)
+    numeral, comma, point = ambiguous[0]
+    raise SessionError(
+        f"the reading '{numeral.text}' is {format_decimal(comma)} with a decimal comma and "
+        f"{format_decimal(point)} with a decimal point, and no other reading decides; {advice}",
+        where=place(numeral.line),
+    )
 
 
 def parse_typed_reading(text: str, *, largest: float = math.inf) -> float:

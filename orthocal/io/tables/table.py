@@ -10,13 +10,7 @@ from typing import Any
 
 from orthocal.errors import SessionError
 from orthocal.io.tables.cell import BLANK, ZIP_SIGNATURE, MergedCells, Row, column_letters
-from orthocal.io.tables.delimited import (
-    HEADER_ROWS,
-    FindHeader,
-    decode,
-    find_separator,
-    split_rows,
-)
+from orthocal.io.tables.delimited import HEADER_ROWS, FindHeader, decode, find_separator, split_rows
 from orthocal.text import shorten
 
 
@@ -131,9 +125,7 @@ def _read_sheet(
 
     sheets = read_workbook(content, where=str(path), sheet=sheet)
     matching = [(s, i) for s in sheets if (i := find_header(s.rows[:HEADER_ROWS])) is not None]
-    names = ", ".join(f"'{s.name}'" for s, _ in matching) or ", ".join(
-        f"'{s.name}'" for s in sheets
-    )
+    names = ", ".join(f"'{s.name}'" for s in [s for s, _ in matching] or sheets)
     if not matching and len(sheets) == 1:
         raise _no_header(f"{path}: sheet {names}", sheets[0].rows, expected, "")
     if not matching:

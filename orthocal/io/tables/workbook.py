@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from lxml import etree
 
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.strict_yaml import LONGEST_NUMBER
 from orthocal.io.tables.cell import (
     BLANK,
@@ -122,8 +122,8 @@ def read_workbook(content: bytes, *, where: str, sheet: str | None = None) -> li
     if parts > MOST_PARTS:
         raise SessionError(f"has {parts} parts; expected at most {MOST_PARTS}", where=where)
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            _require_workbook(archive.namelist(), where)
+        with errors_at(where), zipfile.ZipFile(io.BytesIO(content)) as archive:
+            _require_workbook(archive.namelist())
             return _Workbook(archive, where).read(sheet)
     except (SessionError, MemoryError):
         raise
@@ -134,16 +134,16 @@ def read_workbook(content: bytes, *, where: str, sheet: str | None = None) -> li
         ) from None
 
 
-def _require_workbook(names: list[str], where: str) -> None:
+def _require_workbook(names: list[str]) -> None:
     """Refuse archives of other kinds."""
     if "mimetype" in names and "content.xml" in names:
-        raise SessionError("is an OpenDocument table; save it as .xlsx or CSV", where=where)
+        raise SessionError("is an OpenDocument table; save it as .xlsx or CSV")
     if "xl/workbook.bin" in names:
-        raise SessionError("is an .xlsb workbook; save it as .xlsx or CSV", where=where)
+        raise SessionError("is an .xlsb workbook; save it as .xlsx or CSV")
     if "[Content_Types].xml" not in names:
-        raise SessionError("is a ZIP archive, but not an .xlsx workbook", where=where)
+        raise SessionError("is a ZIP archive, but not an .xlsx workbook")
     if len(set(names)) != len(names):
-        raise SessionError("has several parts of the same name", where=where)
+        raise SessionError("has several parts of the same name")
 
 
 class _Workbook:
@@ -153,8 +153,7 @@ class _Workbook:
         self._archive = archive
         self._where = where
         self._unpacked = 0
-        targets = {kind: target for kind, target in self._relations("").values()}
-        main = targets.get("officeDocument", "xl/workbook.xml")
+        main = dict(self._relations("").values()).get("officeDocument", "xl/workbook.xml")
         root, relations = self._tree(main), self._relations(main)
         self._sheets = [
             (e.get("name", ""), e.get("state", "visible") == "visible", target)
@@ -164,22 +163,21 @@ class _Workbook:
             for kind, target in [relations.get(value, ("", ""))]
             if kind == "worksheet"
         ]
-        by_kind = {kind: target for kind, target in relations.values()}
+        by_kind = dict(relations.values())
         self._formats: list[NumberFormat] = []
         if "styles" in by_kind:
             self._formats = _read_formats(self._tree(by_kind["styles"]))
-        self._strings = (
-            [_join_text(item) for item in self._elements(by_kind["sharedStrings"], "si")]
-            if "sharedStrings" in by_kind
-            else []
-        )
+        self._strings: list[str] = []
+        if "sharedStrings" in by_kind:
+            items = self._elements(by_kind["sharedStrings"], "si")
+            self._strings = [_join_text(item) for item in items]
         old_epoch = any(e.get("date1904") in ("1", "true") for e in root.iter("{*}workbookPr"))
         self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
 
     def read(self, name: str | None) -> list[Sheet]:
         """Read the visible sheets, all sheets if none is visible, or the sheet with a name."""
         if not self._sheets:
-            raise SessionError("is a workbook without worksheets", where=self._where)
+            raise SessionError("is a workbook without worksheets")
         chosen = [s for s in self._sheets if s[1]] or self._sheets
         if name is not None:
             chosen = [s for s in self._sheets if s[0] == name] or [
@@ -187,9 +185,7 @@ class _Workbook:
             ]
             if not chosen:
                 names = ", ".join(f"'{title}'" for title, _, _ in self._sheets)
-                raise SessionError(
-                    f"has no sheet '{shorten(name)}'; sheets: {names}", where=self._where
-                )
+                raise SessionError(f"has no sheet '{shorten(name)}'; sheets: {names}")
             chosen = chosen[:1]
         return [self._read_sheet(title, part) for title, _, part in chosen]
 
@@ -337,33 +333,24 @@ class _Workbook:
         try:
             info = self._archive.getinfo(part)
         except KeyError:
-            raise SessionError(
-                f"is damaged: {shorten(part)} is missing", where=self._where
-            ) from None
+            raise SessionError(f"is damaged: {shorten(part)} is missing") from None
         self._unpacked += info.file_size
         for size, limit in ((info.file_size, largest), (self._unpacked, LARGEST_CONTENT)):
             if size > limit:
                 raise SessionError(
                     f"has {size / 2**20:.1f} MiB unpacked up to {shorten(part)}; expected at most "
-                    f"{limit / 2**20:g} MiB",
-                    where=self._where,
+                    f"{limit / 2**20:g} MiB"
                 )
         try:
             text = self._archive.read(info)
         except Exception:  # damaged archives raise zlib.error, BadZipFile, RuntimeError and more
             raise SessionError(
-                f"is damaged or protected by a password: {shorten(part)} cannot be unpacked",
-                where=self._where,
+                f"is damaged or protected by a password: {shorten(part)} cannot be unpacked"
             ) from None
         if _DOCTYPE.search(text) or not text.removeprefix(b"\xef\xbb\xbf").startswith(b"<"):
-            raise SessionError(
-                f"is not a regular .xlsx workbook: {shorten(part)} is not plain XML",
-                where=self._where,
-            )
+            raise SessionError(f"is not a regular .xlsx workbook: {shorten(part)} is not plain XML")
         if text.count(b"<") > MOST_TAGS:
-            raise SessionError(
-                f"has more than {MOST_TAGS} XML tags in {shorten(part)}", where=self._where
-            )
+            raise SessionError(f"has more than {MOST_TAGS} XML tags in {shorten(part)}")
         return text
 
 

@@ -118,14 +118,7 @@ def stream_columns(
         SessionError: If the table or a row is wrong; names file and line.
     """
     lines = read_lines(source, longest=LONGEST_LINE, name=name, error=SessionError)
-    rows = csv_rows(
-        lines,
-        name=name,
-        required=tuple(columns),
-        optional=ignored,
-        error=SessionError,
-        most=most,
-    )
+    rows = csv_rows(lines, name=name, required=tuple(columns), optional=ignored, most=most)
     empty = True
     while block := list(islice(rows, BLOCK_ROWS)):
         empty = False

@@ -18,7 +18,7 @@ from orthocal.effects.compensation import (
     home_positions,
     with_homes,
 )
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError, errors_at
 from orthocal.io.documents import LARGEST_NUMBER, parse_number, read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
@@ -79,18 +79,18 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     trajectory = sections.get("TRAJ", {})
     joints, opposed = [], []
     for i, drive in enumerate(robot.drives):
-        unit, where = drive.joint_unit, f"{path}: [JOINT_{i}]"
-        _require_unit(trajectory, UNIT_KEYS[unit], unit, f"{path}: [TRAJ]")
-        keys = sections.get(f"JOINT_{i}")
-        if keys is None:
-            raise ParameterError(
-                f"the section is missing; it belongs to drive {drive.name}", where=where
-            )
-        _require_unit(keys, "UNITS", unit, where)
-        home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
-        if (latch or 0) * _read_number(keys, "HOME_SEARCH_VEL", where) < 0.0:
-            opposed.append(f"[JOINT_{i}]")
-        joints.append((home, _read_limits(keys, drive, where), latch, trim))
+        unit = drive.joint_unit
+        with errors_at(f"{path}: [TRAJ]"):
+            _require_unit(trajectory, UNIT_KEYS[unit], unit)
+        with errors_at(f"{path}: [JOINT_{i}]"):
+            keys = sections.get(f"JOINT_{i}")
+            if keys is None:
+                raise ParameterError(f"the section is missing; it belongs to drive {drive.name}")
+            _require_unit(keys, "UNITS", unit)
+            home, latch, trim = _read_joint(keys, drive, folder=path.parent)
+            if (latch or 0) * _read_number(keys, "HOME_SEARCH_VEL") < 0.0:
+                opposed.append(f"[JOINT_{i}]")
+            joints.append((home, _read_limits(keys, drive), latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
     known = stated or any(home is not None for home in homes)
@@ -103,16 +103,16 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     )
 
 
-def _read_number(keys: Mapping[str, str], key: str, where: str) -> float:
+def _read_number(keys: Mapping[str, str], key: str) -> float:
     """Number of a key; 0 if it is not stated.
 
     Raises:
         ParameterError: If it is no number.
     """
-    return parse_number(keys.get(key, "0"), where=where, name=key, error=ParameterError)
+    return parse_number(keys.get(key, "0"), name=key, error=ParameterError)
 
 
-def _require_unit(keys: Mapping[str, str], key: str, unit: str, where: str) -> None:
+def _require_unit(keys: Mapping[str, str], key: str, unit: str) -> None:
     """Refuse a section that states another unit than that of a drive, mm or deg.
 
     Raises:
@@ -120,7 +120,7 @@ def _require_unit(keys: Mapping[str, str], key: str, unit: str, where: str) -> N
     """
     stated = keys.get(key)
     if stated is not None and stated.casefold() not in UNIT_WORDS[unit]:
-        raise ParameterError(f"{key} is {stated}; expected {unit}", where=where)
+        raise ParameterError(f"{key} is {stated}; expected {unit}")
 
 
 def _read_offsets(text: str, drives: Sequence[Drive]) -> tuple[float, ...] | None:
@@ -138,7 +138,7 @@ def _read_offsets(text: str, drives: Sequence[Drive]) -> tuple[float, ...] | Non
 
 
 def _read_joint(
-    keys: Mapping[str, str], drive: Drive, *, folder: Path, where: str
+    keys: Mapping[str, str], drive: Drive, *, folder: Path
 ) -> tuple[float | None, int | None, JointTrim]:
     """Home offset, [m, rad], sign of HOME_LATCH_VEL and compensation of a joint.
 
@@ -148,29 +148,25 @@ def _read_joint(
         keys: Keys of its section.
         drive: Its drive.
         folder: Directory to which the name of its COMP_FILE is relative.
-        where: File and section, for messages.
 
     Raises:
         ParameterError: If a number is wrong.
         SessionError: If the COMP_FILE is wrong.
     """
     numbers = {
-        key: _read_number(keys, key, where)
+        key: _read_number(keys, key)
         for key in ("HOME_OFFSET", "HOME_LATCH_VEL", "BACKLASH", "COMP_FILE_TYPE")
     }
     unit, factor = drive.joint_unit, drive.joint_size
     if not 0.0 <= numbers["BACKLASH"] <= LARGEST_TRIM:
         raise ParameterError(
-            f"BACKLASH is {numbers['BACKLASH']:g} {unit}; expected 0 to {LARGEST_TRIM:g} {unit}",
-            where=where,
+            f"BACKLASH is {numbers['BACKLASH']:g} {unit}; expected 0 to {LARGEST_TRIM:g} {unit}"
         )
     name, table = keys.get("COMP_FILE"), None
     if name is not None:
         if numbers["COMP_FILE_TYPE"] != 1.0:
-            raise ParameterError(
-                f"COMP_FILE_TYPE is {numbers['COMP_FILE_TYPE']:g}; expected 1", where=where
-            )
-        table = read_comp_file(folder, name, drive, where)
+            raise ParameterError(f"COMP_FILE_TYPE is {numbers['COMP_FILE_TYPE']:g}; expected 1")
+        table = read_comp_file(folder, name, drive)
     latch = None
     if "HOME_LATCH_VEL" in keys:
         latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
@@ -178,7 +174,7 @@ def _read_joint(
     return home, latch, JointTrim(numbers["BACKLASH"] * factor, table)
 
 
-def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[float, float]:
+def _read_limits(keys: Mapping[str, str], drive: Drive) -> tuple[float, float]:
     """MIN_LIMIT and MAX_LIMIT of a joint, [m, rad]; infinite if not stated.
 
     Numbers beyond LARGEST_NUMBER are infinite, too: for LinuxCNC, ±1e99 means no limit.
@@ -188,17 +184,14 @@ def _read_limits(keys: Mapping[str, str], drive: Drive, where: str) -> tuple[flo
     """
     factor = drive.joint_size
     stated = (
-        parse_number(
-            keys.get(key, default), where=where, name=key, error=ParameterError, largest=math.inf
-        )
+        parse_number(keys.get(key, default), name=key, error=ParameterError, largest=math.inf)
         for key, default in (("MIN_LIMIT", "-1e99"), ("MAX_LIMIT", "1e99"))
     )
     low, high = (v if abs(v) <= LARGEST_NUMBER else math.copysign(math.inf, v) for v in stated)
     if low >= high:
         raise ParameterError(
             f"MIN_LIMIT is {low:g} {drive.joint_unit}, not below MAX_LIMIT, "
-            f"{high:g} {drive.joint_unit}",
-            where=where,
+            f"{high:g} {drive.joint_unit}"
         )
     return low * factor, high * factor
 
@@ -226,7 +219,7 @@ def _read_sections(text: str, path: Path) -> Mapping[str, Mapping[str, str]]:
     return sections
 
 
-def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
+def read_comp_file(folder: Path, name: str, drive: Drive) -> Array:
     """Table of a COMP_FILE of type 1: position, forward trim, reverse trim.
 
     The content of a file outside the directory is not quoted in messages.
@@ -235,44 +228,41 @@ def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
         folder: Directory to which `name` is relative.
         name: Name of the table.
         drive: Drive of the joint.
-        where: File and section, or file and key, for messages.
 
     Returns:
         Shape (n, 3), [m, rad].
 
     Raises:
-        SessionError: If the table is wrong; names file and line.
+        SessionError: If the table is wrong; names file and line, or no place for a wrong name.
     """
     if not name.strip() or "\0" in name:
-        raise SessionError(f"found {name!r}; expected a file name", where=where)
+        raise SessionError(f"found {name!r}; expected a file name")
     file, unit = folder / name, drive.joint_unit
     with content_withheld_outside(folder, file):
         text = read_text(file, error=SessionError)
         rows = list[list[float]]()
         for number, line in enumerate(text.splitlines(), start=1):
-            at = f"{file}:{number}"
             if not (cells := line.split()):
                 continue
-            if len(cells) != len(COMP_FILE_COLUMNS):
-                raise SessionError(
-                    f"has {len(cells)} numbers; expected {', '.join(COMP_FILE_COLUMNS)}", where=at
-                )
-            row = [
-                parse_number(cell, where=at, name=column, error=SessionError)
-                for cell, column in zip(cells, COMP_FILE_COLUMNS, strict=True)
-            ]
-            if rows and row[0] <= rows[-1][0]:
-                raise SessionError(
-                    f"positions must increase: {row[0]:g} {unit} follows {rows[-1][0]:g} {unit}",
-                    where=at,
-                )
-            if max(map(abs, row[1:])) > LARGEST_TRIM:
-                raise SessionError(
-                    f"found a trim of {max(row[1:], key=abs):g} {unit}; expected at most "
-                    f"{LARGEST_TRIM:g} {unit}; is the table of COMP_FILE_TYPE = 0?",
-                    where=at,
-                )
-            rows.append(row)
+            with errors_at(f"{file}:{number}"):
+                if len(cells) != len(COMP_FILE_COLUMNS):
+                    raise SessionError(
+                        f"has {len(cells)} numbers; expected {', '.join(COMP_FILE_COLUMNS)}"
+                    )
+                row = [
+                    parse_number(cell, name=column, error=SessionError)
+                    for cell, column in zip(cells, COMP_FILE_COLUMNS, strict=True)
+                ]
+                if rows and row[0] <= rows[-1][0]:
+                    raise SessionError(
+                        f"positions must increase: {row[0]:g} {unit} follows {rows[-1][0]:g} {unit}"
+                    )
+                if max(map(abs, row[1:])) > LARGEST_TRIM:
+                    raise SessionError(
+                        f"found a trim of {max(row[1:], key=abs):g} {unit}; expected at most "
+                        f"{LARGEST_TRIM:g} {unit}; is the table of COMP_FILE_TYPE = 0?"
+                    )
+                rows.append(row)
         if not 1 < len(rows) <= MAX_COMP_FILE_ENTRIES:
             raise SessionError(
                 f"has {len(rows)} entries; expected 2 to {MAX_COMP_FILE_ENTRIES}", where=str(file)

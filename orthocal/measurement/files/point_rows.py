@@ -87,7 +87,7 @@ class PointRows:
         """Refuse a row with numbers in columns of other sensors.
 
         Raises:
-            SessionError: If there is such a number; names file, line and column.
+            SessionError: If there is such a number; names the column.
         """
         point = self.is_point(row)
         wrong = ("reading_mm",) if point else (*COORDINATES, *COVARIANCES)
@@ -95,13 +95,11 @@ class PointRows:
             if text := getattr(row, column):
                 kind = "points: x_mm, y_mm and z_mm" if point else "a reading: reading_mm"
                 raise SessionError(
-                    f"{column} is '{text}'; expected an empty cell: setup {row.setup} has {kind}",
-                    where=row.where,
+                    f"{column} is '{text}'; expected an empty cell: setup {row.setup} has {kind}"
                 )
         if point and row.minus:
             raise SessionError(
-                f"minus is '{row.minus}'; expected an empty cell in a row of a point",
-                where=row.where,
+                f"minus is '{row.minus}'; expected an empty cell in a row of a point"
             )
 
     def split(self, row: RawReading, values: Sequence[float]) -> dict[str, float]:
@@ -125,14 +123,14 @@ class PointRows:
         key = row.setup, " ".join(texts)
         if key not in self._setups_by_covariance:
             numbers = [
-                parse_number(text, where=row.where, name=c, error=SessionError)
+                parse_number(text, name=c, error=SessionError)
                 for c, text in zip(COVARIANCES, texts, strict=True)
             ]
             xx, yy, zz, xy, xz, yz = numbers
             try:
                 covariance = read_covariance([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             except SessionError as e:
-                raise SessionError(f"the covariance {e.problem}", where=row.where) from None
+                raise SessionError(f"the covariance {e.problem}") from None
             first = self.setups[self._setups_by_base[row.setup][0]]
             sensor = replace(cast(Points, first.sensor).in_file, covariance=covariance)
             base = replace(first, name=row.setup, sensor=sensor)

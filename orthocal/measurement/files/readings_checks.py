@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import parse_number
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.point_rows import PointRows, value_name
@@ -20,16 +20,11 @@ from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.observation.conditions import needed_conditions
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import (
-    LARGEST_READING,
-    is_difference,
-    largest_reading,
-    reads_pairs,
-)
+from orthocal.sensors.protocol import is_difference, largest_reading, reads_pairs
 from orthocal.session.completeness import require_name
 from orthocal.session.differences import IndependentReadings
 from orthocal.session.points import count_readings
-from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
+from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session, Setup
 from orthocal.text import shorten, spans
 from orthocal.units import MM
 
@@ -73,9 +68,10 @@ def check_readings(
     needs_approach = "approach" in needed_conditions(session.robot)
     accepted, points = _AcceptedReadings(file, needs_approach=needs_approach), PointRows(session)
     for row in rows:
-        for reading in parse_row(row, session, points):
-            setup = points.setups[reading.setup]
-            accepted.add(row, reading, of_pair=reads_pairs(setup.sensor))
+        with errors_at(row.where):
+            for reading in parse_row(row, session, points):
+                setup = points.setups[reading.setup]
+                accepted.add(row, reading, of_pair=reads_pairs(setup.sensor))
     if not accepted.readings:
         raise SessionError("holds no readings", where=str(file))
     out_of_range = _find_out_of_range(accepted, points)
@@ -104,15 +100,13 @@ def _find_out_of_range(accepted: _AcceptedReadings, points: PointRows) -> dict[s
         try:
             check_range(
                 reading.value / MM,
+                setup,
                 points.gauges[setup.gauge],
-                difference=is_difference(reading.minus, setup.sensor),
-                where=place,
-                name=value_name(reading.setup),
-                largest=largest_reading(setup.sensor),
+                minus=reading.minus,
                 of_setup_mm=of_setup_mm.get(reading.setup, ()),
             )
         except SessionError as e:
-            errors.setdefault(place, e)
+            errors.setdefault(place, SessionError(e.problem, where=place))
     return errors
 
 
@@ -168,27 +162,25 @@ def parse_row(row: RawReading, session: Session, points: PointRows) -> list[Read
     Raises:
         SessionError: If the row contradicts the session; names file and line.
     """
-    _check_names(row, session, points)
-    columns = COORDINATES if points.is_point(row) else ("reading_mm",)
-    values = [_parse_value(row, column) * MM for column in columns]
-    missing = [c for c, v in zip(columns, values, strict=True) if math.isnan(v)]
-    if missing and len(missing) < len(values):
-        raise SessionError(
-            f"{missing[0]} is empty; expected all three coordinates of the point", where=row.where
-        )
-    cycle, conditions = parse_cycle(row.cycle, row.where), parse_conditions(row, session.robot)
-    value_by_setup = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
+    with errors_at(row.where):
+        _check_names(row, session, points)
+        columns = COORDINATES if points.is_point(row) else ("reading_mm",)
+        values = [_parse_value(getattr(row, column), column) * MM for column in columns]
+        missing = [c for c, v in zip(columns, values, strict=True) if math.isnan(v)]
+        if missing and len(missing) < len(values):
+            raise SessionError(
+                f"{missing[0]} is empty; expected all three coordinates of the point"
+            )
+        cycle, conditions = parse_cycle(row.cycle), parse_conditions(row, session.robot)
+        by_setup = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
     return [
         Reading(name, row.posture, row.minus or None, cycle, value, row.line, conditions=conditions)
-        for name, value in value_by_setup.items()
+        for name, value in by_setup.items()
     ]
 
 
-def _parse_value(row: RawReading, column: str) -> float:
-    text = getattr(row, column)
-    if not text:
-        return math.nan
-    return parse_number(text, where=row.where, name=column, error=SessionError)
+def _parse_value(text: str, column: str) -> float:
+    return parse_number(text, name=column, error=SessionError) if text else math.nan
 
 
 class _AcceptedReadings:
@@ -218,16 +210,16 @@ class _AcceptedReadings:
             of_pair: Whether the sensor reads pairs of postures; these readings are independent.
 
         Raises:
-            SessionError: If the reading disagrees with the previous ones; names file and line.
+            SessionError: If the reading disagrees with the previous ones.
         """
         if reading.key in self._first_lines:
-            raise SessionError(self._describe_repetition(reading), where=row.where)
+            raise SessionError(self._describe_repetition(reading))
         self._first_lines[reading.key] = row.line
         self._require_consistent_time_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
         if not of_pair:
-            self._independent.add(reading, row.where)
+            self._independent.add(reading)
         self.readings.append(reading)
         self.places.append(row.where)
 
@@ -255,27 +247,23 @@ class _AcceptedReadings:
         if len(self._first_line_by_zoned) > 1:
             raise SessionError(
                 f"time is '{row.time}'; expected all times of a session with a time zone, or all "
-                f"without one, as in line {self._first_line_by_zoned[not zoned]}",
-                where=row.where,
+                f"without one, as in line {self._first_line_by_zoned[not zoned]}"
             )
 
 
 def _check_names(row: RawReading, session: Session, points: PointRows) -> None:
     """Refuse a setup or postures that the session does not have, and cells of other sensors."""
-    require_name(row.setup, points.names, "setup", where=row.where)
+    require_name(row.setup, points.names, "setup")
     points.check_columns(row)
     for name in (row.posture, row.minus) if row.minus else (row.posture,):
-        require_name(name, session.postures, "posture", where=row.where)
+        require_name(name, session.postures, "posture")
     if row.minus == row.posture:
-        raise SessionError(
-            f"posture and minus are both '{row.posture}'; expected two postures", where=row.where
-        )
+        raise SessionError(f"posture and minus are both '{row.posture}'; expected two postures")
     setup = session.setups.get(row.setup)
     if setup is not None and reads_pairs(setup.sensor) and not row.minus:
         raise SessionError(
             f"minus is empty; expected the second posture of the pair: setup {row.setup} has a "
-            f"{setup.sensor.describe()}",
-            where=row.where,
+            f"{setup.sensor.describe()}"
         )
 
 
@@ -283,7 +271,7 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
     """Conditions of a row; None if it states none.
 
     Raises:
-        SessionError: If a condition is wrong; names file, line and column.
+        SessionError: If a condition is wrong; names the column.
     """
     stated = {column: text for column in CONDITIONS if (text := getattr(row, column))}
     if not stated:
@@ -292,75 +280,58 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
         column, text = next(iter(stated.items()))
         raise SessionError(
             f"{column} is '{shorten(text)}'; expected an empty cell: the row has two postures, and "
-            "conditions belong to readings in one posture",
-            where=row.where,
+            "conditions belong to readings in one posture"
         )
-    if row.approach:
-        require_approach(row.approach, robot, row.where)
-    return Conditions(
+    conditions = Conditions(
         row.approach or None,
-        parse_temperature(row.temperature_C, row.where) if row.temperature_C else None,
-        parse_time(row.time, row.where) if row.time else None,
+        parse_temperature(row.temperature_C) if row.temperature_C else None,
+        parse_time(row.time) if row.time else None,
     )
+    check_conditions(conditions, robot, two_postures=False)
+    return conditions
 
 
-def check_conditions(
-    conditions: Conditions, robot: Robot, *, two_postures: bool, where: str
-) -> None:
+def check_conditions(conditions: Conditions, robot: Robot, *, two_postures: bool) -> None:
     """Refuse conditions that a reading cannot have.
 
     Args:
         conditions: The conditions.
         robot: The robot.
         two_postures: Whether the reading belongs to two postures.
-        where: File and line, or name of the reading, for messages.
 
     Raises:
         SessionError: If the reading cannot have the conditions.
     """
     if two_postures and conditions != Conditions():
-        raise SessionError(
-            "has two postures; conditions belong to readings in one posture", where=where
-        )
-    if conditions.approach is not None:
-        require_approach(conditions.approach, robot, where)
+        raise SessionError("has two postures; conditions belong to readings in one posture")
+    approach = conditions.approach
+    if approach is not None and (problem := find_approach_problem(approach, robot)):
+        raise SessionError(f"approach is {problem}")
     if conditions.temperature is not None:
-        _require_temperature(conditions.temperature, where)
+        _require_temperature(conditions.temperature)
 
 
-def require_approach(text: str, robot: Robot, where: str) -> None:
-    """Refuse an approach that is not a letter for each drive.
-
-    Raises:
-        SessionError: If the approach is wrong.
-    """
-    problem = find_approach_problem(text, robot)
-    if problem:
-        raise SessionError(f"approach is {problem}", where=where)
-
-
-def parse_temperature(text: str, where: str) -> float:
+def parse_temperature(text: str) -> float:
     """Temperature, [°C].
 
     Raises:
         SessionError: If the text is not a number from LOWEST_C to HIGHEST_C.
     """
-    value = parse_number(text, where=where, name="temperature_C", error=SessionError)
-    _require_temperature(value, where)
+    value = parse_number(text, name="temperature_C", error=SessionError)
+    _require_temperature(value)
     return value
 
 
-def _require_temperature(value: float, where: str) -> None:
+def _require_temperature(value: float) -> None:
     """Refuse a temperature, [°C], that no workshop has."""
     if not LOWEST_C <= value <= HIGHEST_C:
         raise SessionError(
             f"temperature_C is {value:g}; expected degrees Celsius from {LOWEST_C:g} to "
-            f"{HIGHEST_C:g}",
-            where=where,
+            f"{HIGHEST_C:g}"
         )
 
 
-def parse_time(text: str, where: str) -> datetime:
+def parse_time(text: str) -> datetime:
     """Date and time of day.
 
     Raises:
@@ -373,12 +344,11 @@ def parse_time(text: str, where: str) -> datetime:
     except ValueError:
         raise SessionError(
             f"time is '{shorten(text)}'; expected date and time of ISO 8601, such as "
-            "2025-03-14T09:26:53 or 2025-03-14T09:26:53+01:00",
-            where=where,
+            "2025-03-14T09:26:53 or 2025-03-14T09:26:53+01:00"
         ) from None
 
 
-def parse_cycle(text: str, where: str) -> int:
+def parse_cycle(text: str) -> int:
     """Cycle of a row; 1 if its cell is empty.
 
     Raises:
@@ -387,36 +357,27 @@ def parse_cycle(text: str, where: str) -> int:
     if not text:
         return 1
     if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= 1):
-        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...", where=where)
+        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...")
     return int(text)
 
 
 def check_range(
-    value_mm: float,
-    gauge: Gauge,
-    *,
-    difference: bool,
-    where: str,
-    name: str = "reading_mm",
-    largest: float = LARGEST_READING,
-    of_setup_mm: ArrayLike = (),
+    value_mm: float, setup: Setup, gauge: Gauge, *, minus: str | None, of_setup_mm: ArrayLike
 ) -> None:
     """Refuse a reading beyond the range of the gauge or of its kind of sensor. NaN passes.
 
     Args:
         value_mm: Reading, [mm].
-        gauge: The gauge.
-        difference: Whether the reading is a difference of two postures.
-        where: File and line, or name of the reading, for messages.
-        name: Name of the value, for messages.
-        largest: Largest reading of the kind of sensor, [m].
+        setup: Its setup.
+        gauge: The gauge of the setup.
+        minus: Posture whose reading is subtracted; None for a single reading.
         of_setup_mm: Readings of the setup, [mm]. If most are in range, a larger reading may have a
             misplaced decimal point.
 
     Raises:
         SessionError: If the reading is out of range.
     """
-    largest_mm = largest / MM
+    difference, largest_mm = is_difference(minus, setup.sensor), largest_reading(setup.sensor) / MM
     range_mm = (-largest_mm, largest_mm) if gauge.range is None else [v / MM for v in gauge.range]
     lowest, highest = range_mm
     if difference and gauge.range is not None:
@@ -433,10 +394,8 @@ def check_range(
     if ratio > POINT_HINT_RATIO and 2 * n_in_range > of_setup.size:
         hint = "; its decimal point may be misplaced"
     if beyond_sensor:
-        expected = (
-            f"expected a number within ±{largest_mm:g}, the limit of this kind of sensor{hint}"
-        )
+        expected = f"expected a number within ±{largest_mm:g}, the limit of this kind of sensor"
     else:
         kind = "a difference" if difference else "a reading"
-        expected = f"the gauge's range allows {kind} from {limits}{hint}"
-    raise SessionError(f"{name} is {value_mm:g}; {expected}", where=where)
+        expected = f"the gauge's range allows {kind} from {limits}"
+    raise SessionError(f"{value_name(setup.name)} is {value_mm:g}; {expected}{hint}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from decimal import Decimal
@@ -22,12 +22,9 @@ from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, read_text
 from orthocal.io.tables.cell import ZIP_SIGNATURE, Row
 from orthocal.io.tables.delimited import SEPARATORS, decode, stated_separator
 from orthocal.io.tables.numerals import (
-    DecimalSign,
     Numeral,
     Sign,
-    UnknownSign,
-    format_decimal,
-    infer_decimal_sign,
+    decide_decimal_sign,
     parse_numeral,
     plain_minus,
 )
@@ -153,62 +150,6 @@ def _schema(header: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return REQUIRED_OF_POINTS, tuple(name for name in COLUMNS if name not in REQUIRED_OF_POINTS)
 
 
-def decide_decimal_sign(
-    cells: Sequence[Numeral], *, standard: bool, advice: str, place: Callable[[int], str]
-) -> DecimalSign:
-    """Common decimal sign (point or comma) of the readings of a table.
-
-    Args:
-        cells: The readings.
-        standard: Whether the headings are those of a readings.csv; then a point is a decimal point.
-        advice: Action for the user in case of an ambiguous sign.
-        place: Function from a line to file and line, for messages.
-
-    Raises:
-        SessionError: If both signs are possible, or both occur.
-    """
-    inferred = infer_decimal_sign(cells)
-    ambiguous = [c for c in cells if _is_ambiguous(c.text)]
-    if standard:
-        points = [c for c in ambiguous if "," not in c.text]
-        ambiguous = [c for c in ambiguous if "," in c.text]
-        if isinstance(inferred, DecimalSign) and inferred.sign == "comma" and points:
-            commas = [c for c in cells if _requires_comma(c.text)]
-            rare, frequent = sorted((points, commas), key=len)
-            inferred = UnknownSign(rare[0], frequent[0])
-    if isinstance(inferred, DecimalSign):
-        return inferred
-    if inferred.evidence is not None:
-        rival, other = inferred.rival, inferred.evidence
-        signs = ("point", "comma") if _requires_comma(other.text) else ("comma", "point")
-        raise SessionError(
-            f"the reading '{shorten(rival.text)}' has a decimal {signs[0]}, and "
-            f"'{shorten(other.text)}' in line {other.line} a decimal {signs[1]}; use one decimal "
-            "sign",
-            where=place(rival.line),
-        )
-    if not ambiguous:
-        return DecimalSign("point", None)
-    text = ambiguous[0].text
-    comma, point = parse_numeral(text, "comma"), parse_numeral(text, "point")
-    raise SessionError(
-        f"the reading '{text}' is {format_decimal(comma)} with a decimal comma and "
-        f"{format_decimal(point)} with a decimal point, and no other reading decides; {advice}",
-        where=place(ambiguous[0].line),
-    )
-
-
-def _requires_comma(text: str) -> bool:
-    """True for a numeral that is a number with a decimal comma only."""
-    return parse_numeral(text, "point") is None and parse_numeral(text, "comma") is not None
-
-
-def _is_ambiguous(text: str) -> bool:
-    """True for a numeral with different values for decimal comma and decimal point."""
-    comma, point = parse_numeral(text, "comma"), parse_numeral(text, "point")
-    return comma is not None and point is not None and comma != point
-
-
 def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     """Rows of the readings.csv of a session, with decimal points.
 
@@ -249,7 +190,6 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             name=str(path),
             required=required,
             optional=optional,
-            error=SessionError,
             most=MOST_CSV_ROWS,
         )
 
@@ -260,22 +200,16 @@ def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             for line, row in islice(rows(), MOST_READINGS + 1):
                 names = ("reading_mm", *COORDINATES)
                 numerals += [Numeral(row[name], line) for name in names if row.get(name)]
-        sign = _standard_decimal_sign(numerals, path)
+        if any("," in numeral.text for numeral in numerals):
+            sign = decide_decimal_sign(
+                numerals, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
+            ).sign
     for line, cells in rows():
         cells |= {n: _standard_number(text, sign) for n, text in cells.items() if n in NUMBERS}
         yield RawReading(f"{path}:{line}", line, **cells)
 
 
 SIGN_ADVICE = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
-
-
-def _standard_decimal_sign(cells: Sequence[Numeral], path: Path) -> Sign:
-    """Decimal sign of a table with standard headings, where a point is always a decimal point."""
-    if not any("," in cell.text for cell in cells):
-        return "point"
-    return decide_decimal_sign(
-        cells, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
-    ).sign
 
 
 def _standard_number(text: str, sign: Sign) -> str:

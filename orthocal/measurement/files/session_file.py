@@ -15,6 +15,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
+from orthocal.arrays import triple
 from orthocal.effects.adjustment import require_adjustment
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import load_robot, with_effects
@@ -30,18 +31,20 @@ from orthocal.io.files import (
 from orthocal.measurement.files.point_rows import locate_stations, split_points
 from orthocal.measurement.files.readings_checks import check_readings, require_read
 from orthocal.measurement.files.readings_file import read_rows
-from orthocal.measurement.files.session_controller import (
+from orthocal.measurement.files.session_drives import (
     build_compensation,
     build_firmware,
-    build_offsets,
+    build_postures,
+    read_drive_values,
+    require_mechanical_zero,
 )
 from orthocal.measurement.files.session_keys import (
     MOST_READINGS,
     CalibrationKeys,
+    ControllerKeys,
     GaugeKeys,
     SessionKeys,
 )
-from orthocal.measurement.files.session_postures import build_postures, require_mechanical_zero
 from orthocal.observation.contacts import centre_balls, locate_contacts
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
@@ -50,7 +53,6 @@ from orthocal.sensors.protocol import (
     SetupKeys,
     default_zero,
     reads_pairs,
-    triple,
 )
 from orthocal.sensors.registry import read_setup
 from orthocal.session.completeness import require_name
@@ -246,7 +248,7 @@ def _pair_postures(
 
 
 def read_purpose(
-    keys: CalibrationKeys | None, robot: Robot, *, where: str
+    keys: CalibrationKeys, robot: Robot, *, where: str
 ) -> tuple[Purpose | None, Robot]:
     """Purpose of a session, and its robot with the stated tolerances.
 
@@ -261,8 +263,6 @@ def read_purpose(
     Raises:
         SessionError: If the robot has no such model or name, or a unit or number is invalid.
     """
-    if keys is None:
-        return None, robot
     key = "effects"
     try:
         if keys.effects is not None:
@@ -383,12 +383,13 @@ def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
             raise SessionError(e.problem, where=f"{file}: robot") from None
         raise
     require_mechanical_zero(robot, f"{file}: robot")
-    purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
-    where = f"{file}: controller"
-    offsets = build_offsets(keys.controller, robot, where)
-    compensation = build_compensation(keys.controller, robot, folder=file.parent, where=where)
-    firmware = build_firmware(keys.controller, robot, where)
-    origin = (keys.controller and keys.controller.origin_mm) or (0.0, 0.0, 0.0)
+    purpose, robot = read_purpose(
+        keys.calibration or CalibrationKeys(), robot, where=f"{file}: calibration"
+    )
+    where, controller = f"{file}: controller", keys.controller or ControllerKeys.model_construct()
+    offsets = read_drive_values(controller, "offsets", robot, where)
+    compensation = build_compensation(controller, robot, folder=file.parent, where=where)
+    firmware = build_firmware(controller, robot, where)
     for name in keys.adjusted_mm:
         require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
@@ -417,7 +418,7 @@ def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
         setups=setups,
         readings=(),
         controller_offsets=offsets,
-        controller_origin=triple(origin, MM),
+        controller_origin=triple(controller.origin_mm or (0.0, 0.0, 0.0), MM),
         offsets_from=(
             Path(os.path.normpath(file.parent / keys.offsets_from)) if keys.offsets_from else None
         ),

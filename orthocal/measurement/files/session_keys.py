@@ -5,20 +5,20 @@ The text of a validator's error is `key|problem` where the problem belongs to on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from orthocal.arrays import triple
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Keys, Name, Number, OneKey, PositiveNumber
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import ScaleTolerance
-from orthocal.sensors.protocol import LARGEST_READING, triple
+from orthocal.sensors.protocol import LARGEST_READING
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
-from orthocal.units import DEG, MM, MRAD, Unit
+from orthocal.units import DEG, DRIVE_UNITS, MM, UNIT_SUFFIXES, Unit
 
 LONGEST_PATH = 1000
 """Largest number of characters of a path."""
@@ -60,36 +60,15 @@ FARTHEST_ORIGIN_MM = 1e5
 OriginCoordinate = Annotated[Number, Field(ge=-FARTHEST_ORIGIN_MM, le=FARTHEST_ORIGIN_MM)]
 
 GaugeNoise = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
-RangeLimit = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
+ReadingLimit = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
 
 Adjusted = Annotated[Number, Field(ge=-LARGEST_AMOUNT_MM, le=LARGEST_AMOUNT_MM)]
 
 BacklashValue = Annotated[Number, Field(ge=0.0, le=LARGEST_TRIM)]
 BacklashValues = Annotated[list[BacklashValue], Field(min_length=1, max_length=MAX_DRIVES)]
 
-OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
-    "offsets_mm": ("m", MM),
-    "offsets_deg": ("rad", DEG),
-    "offsets_mrad": ("rad", MRAD),
-}
-"""Offset keys of `controller`: SI unit of their drives and factor to SI."""
-
-BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
-    "backlash_mm": ("m", MM),
-    "backlash_deg": ("rad", DEG),
-}
-"""Backlash keys of `controller`: SI unit of their drives and factor to SI."""
-
-HOME_KEYS: dict[str, tuple[Unit, float]] = {
-    "home_offset_mm": ("m", MM),
-    "home_offset_deg": ("rad", DEG),
-}
-"""The same of home positions."""
-
-
-def keys_for_unit(keys: Mapping[str, tuple[Unit, float]], unit: Unit) -> list[str]:
-    """Keys of one quantity for drives with a unit; a session states one of them."""
-    return [key for key, (of_drives, _) in keys.items() if of_drives == unit]
+Quantity = Literal["offsets", "backlash", "home_offset"]
+"""Quantity of which a controller has a value for each drive."""
 
 
 class GaugeKeys(Keys):
@@ -98,7 +77,7 @@ class GaugeKeys(Keys):
     sigma_mm: GaugeNoise | None = None
     """Standard deviation of a reading."""
     resolution_mm: GaugeNoise | None = None
-    range_mm: Annotated[list[RangeLimit], Field(min_length=2, max_length=2)] | None = None
+    range_mm: Annotated[list[ReadingLimit], Field(min_length=2, max_length=2)] | None = None
     """Lowest and highest reading."""
     tip: TipKeys | None = None
     """Tip; a setup may override it."""
@@ -196,19 +175,33 @@ class ControllerKeys(Keys):
     origin_mm: tuple[OriginCoordinate, OriginCoordinate, OriginCoordinate] | None = None
     """Machine coordinates (G53) of the world's origin; 0, 0, 0 by default."""
 
-    @property
-    def offset_keys(self) -> list[str]:
-        """Offset keys that are stated."""
-        return [key for key in OFFSET_KEYS if getattr(self, key) is not None]
+    def stated(self, quantity: Quantity) -> list[str]:
+        """Keys of a quantity that are stated."""
+        return [key for key in drive_value_keys(quantity) if getattr(self, key) is not None]
 
     @model_validator(mode="after")
     def _require_one_angle_unit(self) -> ControllerKeys:
         """Refuse offsets of revolute drives in two units, and keys without a value."""
         if not self.model_dump(exclude_none=True):
             raise ValueError(f"found none; expected {', '.join(type(self).model_fields)}")
-        if {"offsets_deg", "offsets_mrad"} <= set(self.offset_keys):
+        if {"offsets_deg", "offsets_mrad"} <= set(self.stated("offsets")):
             raise ValueError("found offsets_deg and offsets_mrad; expected one of them")
         return self
+
+
+def drive_value_keys(quantity: Quantity, *units: Unit) -> dict[str, tuple[Unit, float]]:
+    """Keys of `controller` with values of drives: SI unit of these drives and factor to SI.
+
+    Args:
+        quantity: Beginning of the keys.
+        units: SI units of the drives; all by default. A session states one key for each of them.
+    """
+    return {
+        key: UNIT_SUFFIXES[suffix]
+        for key in ControllerKeys.model_fields
+        if (suffix := key.removeprefix(quantity)) in UNIT_SUFFIXES
+        and UNIT_SUFFIXES[suffix][0] in (units or DRIVE_UNITS)
+    }
 
 
 class CalibrationKeys(Keys):

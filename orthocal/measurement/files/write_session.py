@@ -1,4 +1,7 @@
-"""Writing of sessions: a session.yaml with its readings in a CSV beside it, in mm."""
+"""Writing of sessions: a session.yaml with its readings in a CSV beside it, in mm.
+
+Keys are added to a session.yaml such that its comments, order and form remain.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,16 @@ import yaml
 
 from orthocal.arguments import require_kind
 from orthocal.effects.adjustment import subtract_amounts
-from orthocal.effects.compensation import compensates_alike, format_table, table_name
-from orthocal.errors import SessionError
-from orthocal.io.documents import validate
-from orthocal.io.files import exists, write_file, write_files
-from orthocal.measurement.files.point_rows import (
-    is_of_row,
-    point_cells,
+from orthocal.effects.compensation import (
+    compensates_alike,
+    format_table,
+    home_positions,
+    table_name,
 )
+from orthocal.errors import SessionError
+from orthocal.io.documents import read_yaml, validate
+from orthocal.io.files import exists, read_file, write_file, write_files
+from orthocal.measurement.files.point_rows import is_of_row, point_cells
 from orthocal.measurement.files.readings_file import (
     COLUMN_OF_ROLE,
     FIRST_LINE,
@@ -40,6 +45,7 @@ from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.points import base_name, gather_points, names_in_files
 from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session, Setup
+from orthocal.text import composed
 from orthocal.units import DEG, MM, tidy, to_mm, trim_zeros
 
 SAME_OFFSET = 1e-9
@@ -54,31 +60,30 @@ def session_document(session: Session) -> dict[str, Any]:
             `_require_one_state`.
     """
     _require_one_state(session)
-    document: dict[str, Any] = {"robot": session.robot_reference}
-    if session.title:
-        document["title"] = session.title
-    if session.source:
-        document["source"] = session.source
-    if session.seed is not None:
-        document["seed"] = int(session.seed)
     gauges = {
         name: _gauge_document(g) for name, g in session.gauges.items() if base_name(name) == name
     }
-    if "" not in gauges:
-        document["gauges"] = gauges
-    elif gauges[""]:
-        document["gauge"] = gauges[""]
-    document["postures"] = {
-        p.name: _posture_document(p, session.robot) for p in session.postures.values()
+    postures = session.postures.values()
+    entries = {
+        "robot": session.robot_reference,
+        "title": session.title,
+        "source": session.source,
+        "seed": None if session.seed is None else int(session.seed),
+        "gauges": {} if "" in gauges else gauges,
+        "gauge": gauges.get("", {}),
+        "postures": {p.name: _posture_document(p, session.robot) for p in postures},
+        "payload_kg": _payload(session) or None,
+        "controller": _controller_document(session),
+        "adjusted_mm": {n: tidy(v / MM) for n, v in session.adjusted.items()},
+        "calibration": _calibration_document(session),
+        "setups": _setup_documents(session),
+        "readings": "readings.csv",
     }
-    if payload := _payload(session):
-        document["payload_kg"] = payload
-    if controller := _controller_document(session):
-        document["controller"] = controller
-    if session.adjusted:
-        document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
-    if calibration := _calibration_document(session):
-        document["calibration"] = calibration
+    return {key: value for key, value in entries.items() if value not in (None, "", {})}
+
+
+def _setup_documents(session: Session) -> dict[str, dict[str, Any]]:
+    """Keys of each setup by name; a setup of points is one, as in its files."""
     aligned_at, elsewhere = session.alignment_postures, balls_aligned_elsewhere(session)
     setups: dict[str, Any] = {}
     for setup in session.setups.values():
@@ -98,9 +103,7 @@ def session_document(session: Session) -> dict[str, Any]:
                 **({"zero": setup.zero} if setup.zero != default_zero(sensor) else {}),
             },
         )
-    document["setups"] = setups
-    document["readings"] = "readings.csv"
-    return document
+    return setups
 
 
 def _posture_document(posture: Posture, robot: Robot) -> dict[str, list[float]]:
@@ -171,18 +174,18 @@ def _calibration_document(session: Session) -> dict[str, Any]:
 def _controller_document(session: Session) -> dict[str, Any]:
     """Offsets of prismatic drives in mm, of revolute drives in mrad, and the compensation."""
     document: dict[str, Any] = {}
+    stated: dict[str, Sequence[float]] = {}
     if session.controller_offsets is not None:
         for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
             key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
             document.setdefault(key, []).append(tidy(float(offset) / MM))
     if any(joint.backlash or joint.table is None for joint in session.compensation):
-        for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
-            backlash = tidy(joint.backlash / drive.joint_size)
-            document.setdefault(f"backlash_{drive.joint_unit}", []).append(backlash)
-    for drive, joint in zip(session.robot.drives, session.compensation, strict=False):
-        if joint.home is not None:
-            home = tidy(joint.home / drive.joint_size)
-            document.setdefault(f"home_offset_{drive.joint_unit}", []).append(home)
+        stated["backlash"] = [joint.backlash for joint in session.compensation]
+    stated["home_offset"] = home_positions(session.compensation) or ()
+    for quantity, values in stated.items():
+        for drive, value in zip(session.robot.drives, values, strict=False):
+            key = f"{quantity}_{drive.joint_unit}"
+            document.setdefault(key, []).append(tidy(value / drive.joint_size))
     if any(joint.table is not None for joint in session.compensation):
         document["comp_file"] = [
             None if joint.table is None else table_name(i)
@@ -345,3 +348,69 @@ def readings_table(
         )
         rows.append(row)
     return format_readings(rows, blank=blank, needed=needed, required=required or REQUIRED)
+
+
+def add_readings(file: Path, name: str) -> bytes:
+    """Content of a session.yaml with the key `readings` appended.
+
+    Args:
+        file: The session.yaml.
+        name: Name of the readings.csv beside it.
+
+    Raises:
+        SessionError: If the key cannot be appended; says what to add.
+    """
+    content = read_file(file, error=SessionError)
+    extended = content.rstrip() + f"\nreadings: {name}\n".encode()
+    document = read_yaml(file, error=SessionError, content=content) | {"readings": name}
+    if not _has_values(file, extended, document):
+        raise SessionError(f"is missing; add `readings: {name}` to it", where=f"{file}: readings")
+    return extended
+
+
+def add_alignment(file: Path, aligned_at: Mapping[str, str]) -> bytes:
+    """Content of a session.yaml in which setups state their alignment postures.
+
+    Args:
+        file: The session.yaml.
+        aligned_at: Alignment posture by setup, of setups that state none yet.
+
+    Raises:
+        SessionError: If the keys cannot be inserted; says what to add.
+    """
+    content = read_file(file, error=SessionError)
+    document = read_yaml(file, error=SessionError, content=content)
+    text = content.decode()
+    setups = _nodes(_nodes(yaml.compose(text, Loader=yaml.SafeLoader)).get("setups"))
+    insertions = []
+    for name, posture in aligned_at.items():
+        setup = setups.get(name)
+        if not isinstance(setup, yaml.MappingNode) or not setup.value:
+            continue
+        document["setups"][name]["aligned_at"] = posture
+        place = setup.value[0][0].start_mark  # before the first key
+        flow = yaml.safe_dump({"aligned_at": posture}, default_flow_style=True, allow_unicode=True)
+        end = ", " if setup.flow_style else "\n" + " " * place.column
+        insertions.append((place.index, flow.strip()[1:-1] + end))
+    for index, added in sorted(insertions, reverse=True):
+        text = text[:index] + added + text[index:]
+    if len(insertions) < len(aligned_at) or not _has_values(file, text.encode(), document):
+        name, posture = next(iter(aligned_at.items()))
+        raise SessionError(
+            f"is missing; add `aligned_at: {posture}` to it", where=f"{file}: setups.{name}"
+        )
+    return text.encode()
+
+
+def _nodes(node: yaml.Node | None) -> dict[str, yaml.Node]:
+    """Nodes of the values of a mapping, by key; none of another node."""
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    return {composed(key.value): value for key, value in pairs}
+
+
+def _has_values(file: Path, content: bytes, document: Any) -> bool:  # noqa: ANN401 - any document
+    """True if the content of a session.yaml is a document with these values."""
+    try:
+        return bool(read_yaml(file, error=SessionError, content=content) == document)
+    except SessionError:
+        return False

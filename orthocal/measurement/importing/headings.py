@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal, cast, get_args
 
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.tables.cell import Row
 from orthocal.io.tables.numerals import tidy_text
 from orthocal.text import composed, shorten
@@ -64,17 +64,8 @@ WORDS: dict[Role, tuple[str, ...]] = {
     ),
     "cycle": (
         *("cycle", "cycles", "repeat", "repetition", "rep", "rep.", "run", "pass", "round"),
-        *(
-            "wdh",
-            "wdh.",
-            "zyklus",
-            "durchgang",
-            "wiederholung",
-            "lauf",
-            "durchlauf",
-            "messreihe",
-            "umlauf",
-        ),
+        *("wdh", "wdh.", "zyklus", "durchgang", "wiederholung"),
+        *("lauf", "durchlauf", "messreihe", "umlauf"),
     ),
     "reading": (
         *("reading", "readings", "value", "measured", "measured value", "measurement"),
@@ -229,9 +220,12 @@ def split_degrees(text: str) -> tuple[str, Degrees | None]:
 
 def _normalize(text: str) -> str:
     """Heading in lower case with single blanks; empty if it is too long for a heading."""
-    if len(text) > LONGEST_HEADING:
-        return ""
-    return " ".join(tidy_text(composed(text)).casefold().split())
+    return _plain(text).casefold()
+
+
+def _plain(text: str) -> str:
+    """Heading with single blanks; empty if it is too long for a heading."""
+    return " ".join(tidy_text(composed(text)).split()) if len(text) <= LONGEST_HEADING else ""
 
 
 def _split_unit(plain: str) -> tuple[str, UnitName | None]:
@@ -341,15 +335,11 @@ def _find_column(texts: Sequence[str], name: str) -> list[int]:
     if numbered:
         index = int(numbered[1]) - 1
         return [index] if 0 <= index < len(texts) else []
-
-    def plain(text: str) -> str:
-        return " ".join(tidy_text(composed(text)).split()) if len(text) <= LONGEST_HEADING else ""
-
-    wanted = plain(name)
-    plain_texts = [plain(text) for text in texts]
-    exact = [i for i, text in enumerate(plain_texts) if text and text == wanted]
-    folded = wanted.casefold()
-    return exact or [i for i, text in enumerate(plain_texts) if text and text.casefold() == folded]
+    for simplify in (_plain, _normalize):
+        wanted = simplify(name)
+        if indices := [i for i, text in enumerate(map(simplify, texts)) if text and text == wanted]:
+            return indices
+    return []
 
 
 def choose_columns(
@@ -384,23 +374,28 @@ def choose_columns(
             )
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
     headings = _read_headings(texts, assigned, points)
-    roles = {h.role for h in headings if h is not None}
-    optional = {"setup": one_setup, "posture": roles.issuperset(NOMINAL)}
-    single: dict[Role, int] = {}
-    for role in SINGLE:
-        indices = [i for i, h in enumerate(headings) if h is not None and h.role == role]
-        if len(indices) > 1:
-            raise _several_columns(texts, indices, role, where)
-        if indices:
-            single[role] = indices[0]
-        elif not optional.get(role, True):
-            raise _missing_column(role, where)
-    lengths = LENGTHS if "posture" not in single else ("reading", *POINT)
+    columns: dict[Role, list[int]] = {role: [] for role in ROLES}
+    for index, heading in enumerate(headings):
+        if heading is not None:
+            columns[heading.role].append(index)
+    has_points = any(columns[role] for role in POINT)
+    required: dict[Role, bool] = {
+        "setup": not one_setup,
+        "posture": not all(columns[role] for role in NOMINAL),
+        **dict.fromkeys(POINT, has_points),
+    }
+    lengths = ("reading", *POINT) if columns["posture"] else LENGTHS
     readings = {i: h for i, h in enumerate(headings) if h is not None and h.role in lengths}
-    reading_columns = {i: h for i, h in readings.items() if h.role == "reading"}
-    has_points = _check_points(texts, readings, where)
-    if reading_columns or not has_points:
-        _check_readings(texts, reading_columns, single.get("cycle"), where)
+    with errors_at(where):
+        for role in (*SINGLE, *lengths[1:]):
+            if len(columns[role]) > 1:
+                raise _several_columns(texts, columns[role], role)
+            if not columns[role] and required.get(role):
+                raise _missing_column(role)
+        single = {role: columns[role][0] for role in SINGLE if columns[role]}
+        reading_columns = {i: readings[i] for i in columns["reading"]}
+        if reading_columns or not has_points:
+            _check_readings(texts, reading_columns, single.get("cycle"))
     used = {*readings, *single.values()}
     return Columns(
         single=single,
@@ -409,60 +404,41 @@ def choose_columns(
     )
 
 
-def _check_points(texts: Sequence[str], columns: Mapping[int, Heading], where: str) -> bool:
-    """Refuse missing and ambiguous columns of points; True if a table has points."""
-    by_role = {role: [i for i, h in columns.items() if h.role == role] for role in LENGTHS[1:]}
-    has_points = any(by_role[role] for role in POINT)
-    for role, indices in by_role.items():
-        if len(indices) > 1:
-            raise _several_columns(texts, indices, role, where)
-        if not indices and has_points and role in POINT:
-            raise _missing_column(role, where)
-    return has_points
-
-
 def _check_readings(
-    texts: Sequence[str], readings: Mapping[int, Heading], cycle: int | None, where: str
+    texts: Sequence[str], readings: Mapping[int, Heading], cycle: int | None
 ) -> None:
     """Refuse missing and ambiguous columns of readings."""
     if not readings:
-        raise _missing_column("reading", where)
+        raise _missing_column("reading")
     by_cycle: dict[int, list[int]] = {}
     for index, heading in readings.items():
         if heading.cycle is None:
             if len(readings) > 1:
-                raise _several_columns(texts, list(readings), "reading", where)
+                raise _several_columns(texts, list(readings), "reading")
             continue
         if heading.cycle < 1:
             raise SessionError(
-                f"column '{shorten(texts[index])}' is cycle {heading.cycle}; expected 1, 2, 3 ...",
-                where=where,
+                f"column '{shorten(texts[index])}' is cycle {heading.cycle}; expected 1, 2, 3 ..."
             )
         by_cycle.setdefault(heading.cycle, []).append(index)
     for indices in by_cycle.values():
         if len(indices) > 1:
-            raise _several_columns(texts, indices, "reading", where)
+            raise _several_columns(texts, indices, "reading")
     if by_cycle and cycle is not None:
         raise SessionError(
             f"has cycles side by side ('{shorten(texts[min(readings)])}' ...) and a column "
-            f"'{shorten(texts[cycle])}' as well; choose one by --column",
-            where=where,
+            f"'{shorten(texts[cycle])}' as well; choose one by --column"
         )
 
 
-def _missing_column(role: str, where: str) -> SessionError:
+def _missing_column(role: str) -> SessionError:
     """Error about a role without a column."""
-    return SessionError(
-        f"no column has the role {role}; assign one by --column {role}=HEADING", where=where
-    )
+    return SessionError(f"no column has the role {role}; assign one by --column {role}=HEADING")
 
 
-def _several_columns(
-    texts: Sequence[str], indices: Sequence[int], role: str, where: str
-) -> SessionError:
+def _several_columns(texts: Sequence[str], indices: Sequence[int], role: str) -> SessionError:
     """Error about several columns with one role."""
     names = " and ".join(f"'{' '.join(texts[i].split())}' (#{i + 1})" for i in indices[:4])
     return SessionError(
-        f"several columns have the role {role}: {names}; choose one by --column {role}=HEADING",
-        where=where,
+        f"several columns have the role {role}: {names}; choose one by --column {role}=HEADING"
     )

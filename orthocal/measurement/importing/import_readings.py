@@ -14,7 +14,12 @@ from orthocal.io.files import content_withheld_outside, exists, read_file, write
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
 from orthocal.measurement.files.point_rows import PointRows
-from orthocal.measurement.files.readings_checks import check_readings, parse_row, parse_time
+from orthocal.measurement.files.readings_checks import (
+    check_readings,
+    parse_cycle,
+    parse_row,
+    parse_time,
+)
 from orthocal.measurement.files.readings_file import (
     CONDITIONS,
     COORDINATES,
@@ -223,7 +228,7 @@ def _without_clock_times(table: Table, columns: Columns) -> Columns:
     try:
         for text in texts:
             if text:
-                parse_time(text, "")
+                parse_time(text)
     except SessionError:
         single = {role: i for role, i in columns.single.items() if i != time_column}
         return replace(columns, single=single, extra=tuple(sorted((*columns.extra, time_column))))
@@ -265,9 +270,8 @@ def _is_filled(row: RawReading) -> bool:
     return any(getattr(row, column) for column in VALUES)
 
 
-def _key(row: _Row) -> Key:
-    text, (reading, *_) = row
-    return text.setup, reading.posture, reading.minus or "", reading.cycle
+def _key(row: RawReading) -> Key:
+    return row.setup, row.posture, row.minus, parse_cycle(row.cycle)
 
 
 def _merge(
@@ -283,23 +287,25 @@ def _merge(
     """
     pending: dict[Key, list[_Row]] = {}
     for row in new:
-        pending.setdefault(_key(row), []).append(row)
-    existing_counts = Counter(map(_key, existing))
+        pending.setdefault(_key(row[0]), []).append(row)
+    existing_counts = Counter(_key(text) for text, _ in existing)
     rows: list[RawReading] = []
+    rows_by_key: dict[Key, list[RawReading]] = {}
     counts: Counter[str] = Counter()
     differing: list[_Row] = []
     for row in existing:
-        key = _key(row)
+        key = _key(row[0])
         match = _match(row[0], pending.get(key, []), unique=existing_counts[key] == 1)
-        if match is None:
-            rows.append(row[0])
-            continue
-        pending[key].remove(match)
-        change = _change(row, match)
-        counts[change] += 1
-        if change == "replaced" and not differing:
-            differing = [row, match]
-        rows.append(row[0] if change == "unchanged" else _update(row[0], match[0]))
+        merged = row[0]
+        if match is not None:
+            pending[key].remove(match)
+            change = _change(row, match)
+            counts[change] += 1
+            if change == "replaced" and not differing:
+                differing = [row, match]
+            merged = merged if change == "unchanged" else _update(merged, match[0])
+        rows.append(merged)
+        rows_by_key.setdefault(key, []).append(merged)
     if differing and not overwrite:
         (first, _), (other, _) = differing
         more = counts["replaced"] - 1
@@ -310,49 +316,38 @@ def _merge(
             where=first.where,
         )
     added = [row for rows_of_key in pending.values() for row, _ in rows_of_key]
-    _require_approaches(added, [row for row, _ in existing])
-    _refuse_other_approaches(added, [row for row in rows if not _is_filled(row)])
+    for text in added:
+        _check_approach(text, rows_by_key.get(_key(text), []))
     return [*rows, *added], added, counts
 
 
-def _refuse_other_approaches(added: Sequence[RawReading], empty: Sequence[RawReading]) -> None:
-    """Refuse new rows in postures that the session plans to read from another side.
+def _check_approach(row: RawReading, existing: Sequence[RawReading]) -> None:
+    """Refuse a new row that lacks an approach, or is approached from another side than planned.
+
+    Args:
+        row: The new row.
+        existing: Rows of the session with its setup, postures and cycle.
 
     Raises:
-        SessionError: If there is such a row; names the first one and that of the session.
+        SessionError: If the session reads its posture from several sides, or plans another one.
     """
-    for row in added:
-        for planned in empty:
-            same = (row.setup, row.posture, row.minus, row.cycle or "1") == (
-                *(planned.setup, planned.posture, planned.minus),
-                planned.cycle or "1",
-            )
-            if same and {"p", "n"} in map(set, zip(row.approach, planned.approach, strict=False)):
-                raise SessionError(
-                    f"{row.setup} {row.posture} of cycle {row.cycle or 1} is approached with "
-                    f"'{row.approach}', but {planned.where} plans '{planned.approach}'; correct "
-                    "one of them, p where the drive coordinate grows and n where it falls",
-                    where=row.where,
-                )
-
-
-def _require_approaches(added: Sequence[RawReading], existing: Sequence[RawReading]) -> None:
-    """Refuse new rows without an approach in postures that the session reads from several sides.
-
-    Raises:
-        SessionError: If there is such a row; names the first one.
-    """
-    for row in added:
-        key = row.setup, row.posture, row.minus, row.cycle or "1"
-        sides = [
-            r.approach for r in existing if (r.setup, r.posture, r.minus, r.cycle or "1") == key
-        ]
-        if not row.approach and len(sides) > 1 and all(sides):
+    reading, sides = f"{row.setup} {row.posture} of cycle {row.cycle or 1}", []
+    for other in existing:
+        sides.append(other.approach)
+        directions = map(set, zip(row.approach, other.approach, strict=False))
+        if not _is_filled(other) and {"p", "n"} in directions:
             raise SessionError(
-                f"{row.setup} {row.posture} of cycle {key[3]} is read from several sides "
-                f"({', '.join(sides)}); expected a column 'approach' that states which",
+                f"{reading} is approached with '{row.approach}', but {other.where} plans "
+                f"'{other.approach}'; correct one of them, p where the drive coordinate grows and "
+                "n where it falls",
                 where=row.where,
             )
+    if not row.approach and len(sides) > 1 and all(sides):
+        raise SessionError(
+            f"{reading} is read from several sides ({', '.join(sides)}); expected a column "
+            "'approach' that states which",
+            where=row.where,
+        )
 
 
 def _match(row: RawReading, candidates: Sequence[_Row], *, unique: bool) -> _Row | None:

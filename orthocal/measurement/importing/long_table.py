@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.strict_yaml import LONGEST_NUMBER
 from orthocal.io.tables.cell import Cell, Row
 from orthocal.io.tables.numerals import (
     DecimalSign,
     Numeral,
     Sign,
+    decide_decimal_sign,
     is_missing,
     parse_numeral,
     plain_minus,
@@ -30,7 +31,6 @@ from orthocal.io.tables.numerals import (
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import (
     RawReading,
-    decide_decimal_sign,
     format_mm,
     has_standard_headings,
     require_unsplit_numbers,
@@ -151,8 +151,9 @@ def make_long_table(
         if length.number is None:
             rows.skip(length)
             continue
-        value = _parse_value(length, sign.sign)
-        rows.add(length, value, _choose_unit(length, unit, table.header[length.column]))
+        with errors_at(length.row.where):
+            value = _parse_value(length, sign.sign)
+            rows.add(length, value, _choose_unit(length, unit, table.header[length.column]))
     return LongTable(
         rows=rows.located(points or {}),
         missing=tuple(r for r in rows.missing if (r.line, r.cycle) not in rows.by_place),
@@ -183,7 +184,7 @@ class _Rows:
 
     def skip(self, length: LengthCell) -> None:
         """Record an empty cell."""
-        row = _with_session_names(length.row, self.setups, self.postures)
+        row = self._with_session_names(length.row)
         if _is_known(row.setup, self.setups) and _is_known(row.posture, self.postures):
             self.missing.append(row)
         elif (row.line, NO_READING) not in self.skipped[-1:]:
@@ -191,8 +192,8 @@ class _Rows:
 
     def add(self, length: LengthCell, value: Decimal, unit: UnitName) -> None:
         """Record a number."""
-        row = _with_session_names(length.row, self.setups, self.postures)
-        names = zip(_names(length.row), _names(row), strict=True)
+        row = self._with_session_names(length.row)
+        names = ((getattr(length.row, k), getattr(row, k)) for k in ("setup", "posture", "minus"))
         self.renamed |= {old: new for old, new in names if old != new}
         self.units[unit] = None
         with localcontext(prec=2 * LONGEST_NUMBER):
@@ -203,6 +204,15 @@ class _Rows:
         key = row.line, row.cycle
         cell: dict[str, Any] = {f"{length.role}_mm": format_mm(value)}
         self.by_place[key] = replace(self.by_place.get(key, row), **cell)
+
+    def _with_session_names(self, row: RawReading) -> RawReading:
+        """Row with the names in the session instead of those in the table."""
+        return replace(
+            row,
+            setup=_session_name(row.setup, self.setups),
+            posture=_session_name(row.posture, self.postures),
+            minus=_session_name(row.minus, self.postures),
+        )
 
     def located(self, points: Mapping[str, Array]) -> tuple[RawReading, ...]:
         """Rows in which commanded points are replaced by their postures.
@@ -264,20 +274,6 @@ def _require_names(
             )
 
 
-def _names(row: RawReading) -> tuple[str, str, str]:
-    return row.setup, row.posture, row.minus
-
-
-def _with_session_names(row: RawReading, setups: NamesByFold, postures: NamesByFold) -> RawReading:
-    """Row with the names in the session instead of those in the table."""
-    return replace(
-        row,
-        setup=_session_name(row.setup, setups),
-        posture=_session_name(row.posture, postures),
-        minus=_session_name(row.minus, postures),
-    )
-
-
 def _read_lengths(
     table: Table, columns: Columns, skipped: SkippedRows, fill: bool, setup: str
 ) -> Iterator[LengthCell]:
@@ -331,12 +327,11 @@ def _read_lengths(
                 if heading.role not in NOMINAL:
                     yield length
                 continue
-            number, value, unit = _read_number(row.cell(i), where)
-            stated = heading.unit or units_below.get(i)
-            if unit and stated and unit != stated:
-                raise SessionError(
-                    f"the reading is in {unit}, and its heading says {stated}", where=where
-                )
+            with errors_at(where):
+                number, value, unit = _read_number(row.cell(i))
+                stated = heading.unit or units_below.get(i)
+                if unit and stated and unit != stated:
+                    raise SessionError(f"the reading is in {unit}, and its heading says {stated}")
             yield replace(length, number=number, value=value, unit=unit or stated)
 
 
@@ -460,16 +455,14 @@ _NOT_A_NUMBER = {
 }
 
 
-def _read_number(cell: Cell, where: str) -> tuple[str, Decimal | None, UnitName | None]:
+def _read_number(cell: Cell) -> tuple[str, Decimal | None, UnitName | None]:
     """Text, value and unit of the number of a cell; value and unit are None if not known.
 
     Raises:
         SessionError: If the cell is a date, a Boolean, an unsaved formula or a percentage.
     """
     if cell.kind in _NOT_A_NUMBER:
-        raise SessionError(
-            f"the reading {_NOT_A_NUMBER[cell.kind].format(shorten(cell.text))}", where=where
-        )
+        raise SessionError(f"the reading {_NOT_A_NUMBER[cell.kind].format(shorten(cell.text))}")
     if cell.kind == "number":
         return cell.text, cell.number, parse_unit(cell.unit)
     text = tidy_text(cell.text)
@@ -504,25 +497,19 @@ def _parse_value(length: LengthCell, sign: Sign) -> Decimal:
         hint = ""
         if any(parse_numeral(number, s) is not None for s in ("point", "comma")):
             hint = f" with a decimal {sign}"
-        raise SessionError(
-            f"the reading is '{shorten(number)}'; expected a number{hint}", where=length.row.where
-        )
+        raise SessionError(f"the reading is '{shorten(number)}'; expected a number{hint}")
     return value
 
 
 def _choose_unit(length: LengthCell, stated: UnitName | None, heading: str) -> UnitName:
     """Unit of a cell or its heading, or the unit of the option `--unit`."""
-    where = length.row.where
     if stated and length.unit and stated != length.unit:
-        raise SessionError(
-            f"the reading is in {length.unit}, which contradicts --unit {stated}", where=where
-        )
+        raise SessionError(f"the reading is in {length.unit}, which contradicts --unit {stated}")
     unit = length.unit or stated
     if unit is None:
         raise SessionError(
             f"neither the heading '{shorten(' '.join(heading.split()))}' nor the cell has a unit; "
-            "state it by --unit mm, um, inch or hundredths",
-            where=where,
+            "state it by --unit mm, um, inch or hundredths"
         )
     return unit
 

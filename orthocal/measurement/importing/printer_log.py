@@ -15,7 +15,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.effects.loading import load_robot_content
-from orthocal.errors import SessionError
+from orthocal.errors import SessionError, errors_at
 from orthocal.io.documents import read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import exists
@@ -23,7 +23,7 @@ from orthocal.measurement.files.session_keys import LARGEST_READING_MM
 from orthocal.measurement.files.write_session import write_session
 from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmware
 from orthocal.printers.log import LogText, PrinterLog
-from orthocal.printers.settings import DeltaSettings, FirmwareName
+from orthocal.printers.settings import FirmwareName
 from orthocal.robot.model import Robot
 from orthocal.sensors.distance import Distance
 from orthocal.sensors.probe import Probe
@@ -86,9 +86,14 @@ class PrinterImport:
 def recognise_log(path: Path) -> FirmwareName | None:
     """Firmware that wrote a log; None if the file is not clearly such a log."""
     try:
-        return find_firmware(RECEIVED.sub("", read_text(path, error=SessionError)))
+        return find_firmware(_read(path))
     except SessionError:
         return None
+
+
+def _read(path: Path) -> str:
+    """Text of a log as the printer sent it."""
+    return RECEIVED.sub("", read_text(path, error=SessionError))
 
 
 def import_printer_log(
@@ -109,12 +114,7 @@ def import_printer_log(
     Raises:
         SessionError: If a file is wrong or incomplete; names file and line or key.
     """
-    source = LogText(
-        tuple(
-            (str(p), RECEIVED.sub("", read_text(Path(p), error=SessionError)))
-            for p in (*settings, log)
-        )
-    )
+    source = LogText(tuple((str(p), _read(Path(p))) for p in (*settings, log)), radius)
     name = None if firmware is None else require_firmware(firmware, option="--format")
     name = name or find_firmware(source.text[source.begin :]) or find_firmware(source.text)
     if name is None:
@@ -123,7 +123,8 @@ def import_printer_log(
             f"{', '.join(FIRMWARES)}",
             where=str(log),
         )
-    content = FIRMWARES[name].read_log(source, radius=radius)
+    with errors_at(source.name):
+        content = FIRMWARES[name].read_log(source)
     return PrinterImport(content, _session(content, Path(log)))
 
 
@@ -158,7 +159,7 @@ def _session(log: PrinterLog, path: Path) -> Session:
     surface = Artefact("plate", direction_std=TILT_STD, form_degree=4)
     setup = Setup("bed", Probe("-z", surface, (x, y, z), trigger_std=0.0), "", zero="known")
     readings = tuple(
-        Reading("bed", name, None, 1, float(height), None, None)
+        Reading("bed", name, value=float(height))
         for name, height in zip(postures, log.heights, strict=True)
     )
     largest = float(np.abs(log.heights).max())
@@ -201,16 +202,15 @@ def _posture(name: str, carriages: Array) -> Posture:
 
 
 def _robot(log: PrinterLog) -> Robot:
-    """Robot of nominal dimensions: equal rods, towers 120° apart, the firmware's radius."""
+    """Robot of nominal dimensions: equal rods, towers 120° apart, the firmware's radius.
+
+    Its travel contains all coordinates of the carriages.
+    """
+    settings = log.settings
     carriages = np.concatenate([log.carriages, *(d.carriages for d in log.distances)])
-    machine = _design(log.settings, carriages.min(), carriages.max())
+    machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
+    low = max(min(machine.travel[0], carriages.min() - TRAVEL_MARGIN), MM)
+    high = max(*settings.homed, carriages.max(), machine.zero) + TRAVEL_MARGIN
+    machine = replace(machine, travel=(round(float(low), 3), round(float(high), 3)))
     files = {f"{ROBOT}.urdf": machine.urdf(ROBOT), f"{ROBOT}.yaml": machine.yaml()}
     return load_robot_content(ROBOT, {name: text.encode() for name, text in files.items()})
-
-
-def _design(settings: DeltaSettings, lowest: float, highest: float) -> LinearDelta:
-    """Nominal dimensions, with a travel that contains all carriage coordinates, [m]."""
-    machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
-    low = max(min(machine.travel[0], lowest - TRAVEL_MARGIN), MM)
-    high = max(max(settings.homed), highest, machine.zero) + TRAVEL_MARGIN
-    return replace(machine, travel=(round(low, 3), round(high, 3)))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 
 from orthocal.arrays import Array, Indices
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError, SessionError, errors_at
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.coordinate_tables import stream_columns
 from orthocal.measurement.files.readings_file import COORDINATES
@@ -140,11 +140,9 @@ def bin_trace(trace: Trace) -> BinnedTrace:
         std = float(np.sqrt(np.mean([variance for _, _, variance in fits])))
         values = np.array([value for value, _, _ in fits])
         counts = [len(run_bins) for run_bins in bins_by_run]
-        if _averaging_error(values, counts, std) <= MAX_AVERAGING_ERROR * std:
-            break
-        if max(counts) >= MOST_BINS:
-            break
-        if min(b.size for b in bins) < 2 * FEWEST_SAMPLES:
+        is_exact = _averaging_error(values, counts, std) <= MAX_AVERAGING_ERROR * std
+        fewest = min(b.size for b in bins)
+        if is_exact or max(counts) >= MOST_BINS or fewest < 2 * FEWEST_SAMPLES:
             break
         count += 1
     middle = np.array([b[index] for b, (_, index, _) in zip(bins, fits, strict=True)])
@@ -240,10 +238,8 @@ def bin_traces(session: Session, traces: Mapping[str, Trace]) -> dict[str, Binne
     binned = {}
     for name, trace in traces.items():
         require_name(name, session.setups, "setup", where="--trace")
-        try:
+        with errors_at(f"trace of {name}"):
             binned[name] = bin_trace(trace)
-        except SessionError as e:
-            raise SessionError(e.problem, where=f"trace of {name}") from None
     return binned
 
 

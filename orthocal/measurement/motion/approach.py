@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Mask, Triple
 from orthocal.effects.loading import robot_effects
 from orthocal.kinematics.conditions import APPROACH as SIGN_OF_LETTER
 from orthocal.kinematics.conditions import ARROWS
@@ -19,9 +19,9 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import find_below_bed
 from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.protocol import PROBING_DISTANCE, Triple, probing_direction, tool_path
+from orthocal.sensors.protocol import PROBING_DISTANCE, probing_direction, tool_path
 from orthocal.session.session import Posture, Reading, Session
-from orthocal.units import DEG, LIMIT, MM
+from orthocal.units import DEG, LIMIT, MM, Unit
 
 AS_ARROWS_SHOW = (
     "Approach each posture as its arrows show: in the last {} the displayed number of the joint "
@@ -37,6 +37,9 @@ USUAL_LENGTH = 2e-3
 
 USUAL_ANGLE = 0.5 * DEG
 """Usual angle of the approach of a revolute drive, [rad]."""
+
+USUAL: dict[Unit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE}
+"""Both by the unit of the drive."""
 
 SHORTEST_APPROACH = 0.2e-3
 """Least length of the approach of a prismatic drive: five times a usual backlash, [m]."""
@@ -68,17 +71,16 @@ def approach_share(session: Session) -> float:
     never too short to take up the backlash of a drive.
     """
     half_range = min((USUAL_LENGTH, *(g.half_range for g in session.gauges.values())))
-    usual = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE}
     least = max(
         (
             APPROACH_PER_BACKLASH
             * LIMIT
             * session.robot.parameters[error.name].prior_std
-            / usual[error.unit]
+            / USUAL[error.unit]
             for effect in robot_effects(session.robot)
             if "approach" in effect.conditions
             for error in effect.errors
-            if error.unit in usual
+            if error.unit in USUAL
         ),
         default=0.0,
     )
@@ -150,9 +152,7 @@ def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: floa
         other: Letter used in place of u.
         share: Length as a share of the usual length.
     """
-    lengths = share * np.array(
-        [USUAL_LENGTH if d.unit == "m" else USUAL_ANGLE for d in robot.drives]
-    )
+    lengths = share * np.array([USUAL[d.unit] for d in robot.drives])
     return lengths * [SIGN_OF_LETTER[letter] or SIGN_OF_LETTER[other] for letter in approach]
 
 

@@ -118,9 +118,7 @@ def set_dial(session: Session, setup: str) -> str:
         return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
     if not has_dial(of_setup.sensor):
         return "The gauge zero is not set: the calibration estimates it."
-    travel = ""
-    if gauge.range is not None:
-        travel = f", about {gauge.half_range / MM:g} mm"
+    travel = "" if gauge.range is None else f", about {gauge.half_range / MM:g} mm"
     return (
         f"Set the gauge so that its plunger is pressed in by half of its travel{travel}. Then turn "
         f"the bezel until the dial shows {dial_zero(gauge)}."

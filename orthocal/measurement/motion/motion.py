@@ -11,16 +11,20 @@ reach it, it is not below a bed, the tip stays on the rod, and the dial stays in
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 
-from orthocal.arrays import Array
-from orthocal.errors import OrthocalError, SessionError
-from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.arrays import Array, Triple
+from orthocal.errors import ClosureError, OrthocalError, SessionError, UnreachablePathError
+from orthocal.kinematics.continuation import Failures
+from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
+from orthocal.kinematics.tool_rotation import place_turning, rotation_shift
+from orthocal.kinematics.workspace import position_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
     USUAL_LENGTH,
@@ -29,16 +33,7 @@ from orthocal.measurement.motion.approach import (
     probing_starts,
     usual_approaches,
 )
-from orthocal.measurement.motion.guidance import range_of_expected, start_point
-from orthocal.measurement.motion.paths import (
-    Path,
-    SampledPath,
-    guided_setups,
-    probed_setups,
-    require_paths,
-    sample_paths,
-    walk,
-)
+from orthocal.measurement.motion.guidance import below_bed, range_of_expected, start_point
 from orthocal.measurement.motion.stops import (
     SetupMotion,
     Stop,
@@ -52,17 +47,32 @@ from orthocal.measurement.motion.stops import (
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.sensors.protocol import (
-    Triple,
-    has_dial,
-    reads_pairs,
-)
+from orthocal.robot.model import require_tcp
+from orthocal.sensors.protocol import ToolPath, has_dial, probing_direction, reads_pairs, tool_path
 from orthocal.session.order import order_of_measurement
 from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM
 
 MOST_STOPS = 2000
 """Largest number of readings in one plan: two weeks of work."""
+
+
+STEP = 5e-3
+"""Largest distance between samples of a segment, [m]."""
+
+Path = Callable[[Array, Array], Array]
+"""Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
+
+
+class SampledPath(NamedTuple):
+    """Samples of a path."""
+
+    points: Array
+    """Tool coordinates, shape (n, n_coordinates), [m]."""
+    drives: Array
+    """Drive coordinates, shape (n, n_drives), [m, rad]."""
+    passive: Array
+    """Passive coordinates, shape (n, n_passive), [m, rad]."""
 
 
 def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
@@ -89,7 +99,7 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         line = i + FIRST_LINE if reading.line is None else reading.line
         rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    guided, probed = guided_setups(session), probed_setups(session)
+    guided, probed = _guided_setups(session), _probed_setups(session)
     stop_at = find_approaches(session, unguided_places(session, {*guided, *probed}))
     motions = []
     for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
@@ -114,7 +124,7 @@ def common_approach(session: Session) -> str | None:
 
     It is also None if no effect of the machine depends on the approach.
     """
-    places = unguided_places(session, {*guided_setups(session), *probed_setups(session)})
+    places = unguided_places(session, {*_guided_setups(session), *_probed_setups(session)})
     if not places or not usual_approaches(session.robot):
         return None
     for letter in "pn":
@@ -132,7 +142,7 @@ def state_program_approaches(session: Session) -> Session:
 
 def state_possible_path_approaches(session: Session) -> Session:
     """Session as by `state_path_approaches`; unchanged if no program can be made."""
-    guided = {*guided_setups(session), *probed_setups(session)}
+    guided = {*_guided_setups(session), *_probed_setups(session)}
     if any(r.setup in guided and r.approach is None for r in session.readings):
         with suppress(OrthocalError):
             return state_path_approaches(session)
@@ -180,7 +190,7 @@ def state_path_approaches(session: Session) -> Session:
     Raises:
         SessionError: If there are too many readings, or a posture cannot be reached or approached.
     """
-    guided = {*guided_setups(session), *probed_setups(session)}
+    guided = {*_guided_setups(session), *_probed_setups(session)}
     if not guided:
         return session
     if not usual_approaches(session.robot):
@@ -209,14 +219,14 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
     checked, zero = list(stops), start_point(session)
     ends = [(np.asarray(s.approach_point), np.asarray(s.point)) for s in stops]
     starts = [zero, *(point for _, point in ends[:-1])]
-    paths = sample_paths(session, [(a, *b) for a, b in zip(starts, ends, strict=True)])
+    paths = _sample_paths(session, [(a, *b) for a, b in zip(starts, ends, strict=True)])
     indirect = [i for i, path in enumerate(paths) if path is None]
     if indirect:
-        through_zero = sample_paths(session, [(starts[i], zero, *ends[i]) for i in indirect])
+        through_zero = _sample_paths(session, [(starts[i], zero, *ends[i]) for i in indirect])
         for i, path in zip(indirect, through_zero, strict=True):
             paths[i], checked[i] = path, replace(checked[i], via=(zero,))
     how = ", both directly and through the mechanical zero; insert a posture between them"
-    return _predict(session, setup, checked, require_paths(session, setup, checked, paths, how))
+    return _predict(session, setup, checked, _require_paths(session, setup, checked, paths, how))
 
 
 def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path) -> list[Stop]:
@@ -235,7 +245,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
     ends = [np.asarray(others[i]) for i in (-1, 0)] if others else [first + length]
     # nothing is mounted yet: the tool comes from the last posture, or from the second one
-    possible = [np.vstack([walk(path(first, end), length), first]) for end in ends]
+    possible = [np.vstack([_walk(path(first, end), length), first]) for end in ends]
     position, begin, checked, polylines = first, first, list[Stop](), []
     for stop in stops:
         point = np.asarray(stop.point)
@@ -248,8 +258,8 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
         begin = np.asarray(arrival.approach_point)
         polylines.append([position, *arrival.via, begin, point])
         position = point
-    paths = sample_paths(session, polylines)
-    return _predict(session, setup, checked, require_paths(session, setup, checked, paths))
+    paths = _sample_paths(session, polylines)
+    return _predict(session, setup, checked, _require_paths(session, setup, checked, paths))
 
 
 def _probe_stops(
@@ -271,8 +281,8 @@ def _probe_stops(
         [points[i], starts[i], *ends]
         for i, ends in enumerate(zip(starts[1:], points[1:], strict=True))
     ]
-    sampled = sample_paths(session, polylines, probing=True)
-    paths, checked = require_paths(session, setup, stops, sampled), list[Stop]()
+    sampled = _sample_paths(session, polylines, probing=True)
+    paths, checked = _require_paths(session, setup, stops, sampled), list[Stop]()
     drives = nominal_closure(robot).inverse(starts, names=[stop.posture for stop in stops])
     for i, (stop, begin) in enumerate(zip(stops, drives, strict=True)):
         approach = name_approach(stop.drives - begin)
@@ -311,8 +321,8 @@ def _arrive(
     """
     point, closure = possible[0][-1], nominal_closure(session.robot)
     approaches = []
-    for corners, forwards in itertools.product(possible, (True, False)):
-        before = walk(corners[::-1], length)
+    for corners, forwards in product(possible, (True, False)):
+        before = _walk(corners[::-1], length)
         begin = before if forwards else 2.0 * point - before
         drives = closure.inverse(begin[None])[0]
         approach = name_approach(stop.drives - drives)
@@ -383,3 +393,129 @@ def _predict(
         expected = float(predicted[end - 1])
         finished.append(replace(stop, lift=lift, expected=expected, path=paths[i].drives))
     return finished
+
+
+def _guided_setups(session: Session) -> dict[str, Path]:
+    """Prescribed paths of the tool between readings, by setup, for sensors that have one."""
+    if not session.robot.commands_tool:
+        return {}
+    return {
+        name: _in_coordinates(session, path, getattr(setup.sensor, "tool", (0.0, 0.0, 0.0)))
+        for name, setup in session.setups.items()
+        if (path := tool_path(setup.sensor)) is not None
+    }
+
+
+def _probed_setups(session: Session) -> dict[str, Triple]:
+    """Directions of probes, by setup."""
+    if not session.robot.commands_tool:
+        return {}
+    return {
+        name: direction
+        for name, setup in session.setups.items()
+        if (direction := probing_direction(setup.sensor)) is not None
+    }
+
+
+def _in_coordinates(session: Session, path: ToolPath, tool: Triple) -> Path:
+    """Path between coordinates that the drives control: in space, or in the plane of motion.
+
+    Args:
+        session: The session.
+        path: Path of a tool without rotation.
+        tool: Point of the tool that follows the path, in the tool's frame, [m].
+    """
+    robot = session.robot
+    coordinates = list(require_tcp(robot).coordinates)
+    others = [k for k in range(3) if k not in coordinates]
+    normal = [np.eye(3)[others[0]]] if len(others) == 1 else []
+    fixed = position_at_zero(robot)
+
+    def between(start: Array, end: Array) -> Array:
+        ends = np.array([fixed, fixed])
+        on_path = np.array([start, end])
+        ends[:, coordinates] = on_path + rotation_shift(robot, on_path, tool)
+        corners = place_turning(robot, path(*ends, *normal)[:, coordinates], tool)
+        if below_bed(session, corners) and not below_bed(session, on_path):
+            corners = place_turning(robot, path(*ends, *normal, above=True)[:, coordinates], tool)
+        return corners
+
+    return between
+
+
+def _require_paths(
+    session: Session,
+    setup: str,
+    stops: Sequence[Stop],
+    paths: Sequence[SampledPath | None],
+    remark: str = "",
+) -> list[SampledPath]:
+    """Paths to the stops of a setup.
+
+    Raises:
+        UnreachablePathError: If a path leaves the workspace; names the posture.
+    """
+    below = "" if session.robot.bed is None else " or goes below the bed"
+    for stop, path in zip(stops, paths, strict=True):
+        if path is None:
+            raise UnreachablePathError(
+                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace"
+                f"{below}{remark}",
+                setup=setup,
+                posture=stop.posture,
+                where=str(session.path or "session"),
+            )
+    return [path for path in paths if path is not None]
+
+
+def _walk(corners: Array, length: float) -> Array:
+    """Point of a polyline at a distance from its start; its end if the polyline is shorter.
+
+    Args:
+        corners: Shape (n, n_coordinates), [m].
+        length: Distance along the polyline, [m].
+    """
+    for start, end in pairwise(corners):
+        step = float(np.linalg.norm(end - start))
+        if step >= length:
+            return np.asarray(start + length / step * (end - start))
+        length -= step
+    return np.asarray(corners[-1])
+
+
+def _sample_paths(
+    session: Session, polylines: Sequence[Sequence[Array]], *, probing: bool = False
+) -> list[SampledPath | None]:
+    """Samples of polylines of tool coordinates; None if the machine does not reach all of one.
+
+    Args:
+        session: The session.
+        polylines: Corners of each, shape (n_coordinates,) each, [m].
+        probing: Whether a surface stops the last motion of each, so that its end may be below it.
+    """
+    robot, sampled = session.robot, [_sample(corners) for corners in polylines]
+    closure, points, failures = nominal_closure(robot), np.concatenate(sampled), Failures()
+    try:
+        drives, passive = closure.reach(points)  # cached: gauges of a leg have the same path
+    except ClosureError:
+        drives, passive = closure.reach(points, failures=failures)
+    paths, first = list[SampledPath | None](), 0
+    for part, corners in zip(sampled, polylines, strict=True):
+        last = first + len(part)
+        path = SampledPath(part, drives[first:last], passive[first:last])
+        reached = failures.keys().isdisjoint(range(first, last))
+        moved = np.array(corners[1:-1] if probing else corners[1:])
+        if reached and (find_beyond_travel(robot, path.drives) or below_bed(session, moved)):
+            reached = False
+        paths.append(path if reached else None)
+        first = last
+    return paths
+
+
+def _sample(corners: Sequence[Array]) -> Array:
+    """Points of a polyline at distances of at most STEP, shape (n, n_coordinates), [m]."""
+    segments = [corners[0][None]]
+    for start, end in pairwise(corners):
+        count = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP)))
+        segments.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
+    return np.concatenate(segments)

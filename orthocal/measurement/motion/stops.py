@@ -111,25 +111,25 @@ Approaches = dict[Place, Stop]
 
 def stops_on_path(session: Session, setup: str) -> Approaches:
     """Stops of a setup whose approaches follow from its path."""
-    robot = session.robot
-    names = list(session.postures)
+    robot, names = session.robot, list(session.postures)
     nominal = drive_table(session) + session.active_offsets
     tool = nominal_closure(robot).forward(nominal, names=names)
-    points = tool[:, list(require_tcp(robot).coordinates)]
-    unknown = "u" * len(robot.drives)
-    readings = [r for r in session.readings if r.setup == setup]
-    places = {(r.posture, r.approach) for r in readings}
-    places |= {(r.minus, None) for r in readings if r.minus is not None}
-    places |= {(session.alignment_postures[setup], None)}
-    index = {name: i for i, name in enumerate(names)}
-    stops = {}
-    for name, approach in places:
-        drives, point = nominal[index[name]], points[index[name]]
-        stops[name, approach] = Stop(
-            *(name, "reading", None, None, 1, approach or unknown),
-            *(drives, drives, point, point),
+    drives = dict(zip(names, nominal, strict=True))
+    points = dict(zip(names, tool[:, list(require_tcp(robot).coordinates)], strict=True))
+    places = _places([r for r in session.readings if r.setup == setup])
+    return {
+        (name, stated): Stop(
+            *(name, "reading", None, None, 1, fill_approach(robot, stated, "u")),
+            *(drives[name], drives[name], points[name], points[name]),
         )
-    return stops
+        for name, stated in places | {(session.alignment_postures[setup], None)}
+    }
+
+
+def _places(readings: Collection[Reading]) -> set[Place]:
+    """Postures and stated approaches of readings; a subtracted posture has no stated approach."""
+    subtracted = {(r.minus, None) for r in readings if r.minus is not None}
+    return {(r.posture, r.approach) for r in readings} | subtracted
 
 
 def unguided_places(session: Session, guided: Collection[str]) -> list[Place]:
@@ -138,11 +138,9 @@ def unguided_places(session: Session, guided: Collection[str]) -> list[Place]:
     unguided = [r for r in ordered if r.setup not in guided]
     first = {r.setup: r.minus or r.posture for r in reversed(unguided)}
     aligned_at = session.alignment_postures
-    places: set[Place] = {(aligned_at[s], None) for s, p in first.items() if aligned_at[s] != p}
-    places |= {(r.posture, r.approach) for r in unguided}
-    places |= {(r.minus, None) for r in unguided if r.minus is not None}
+    aligned: set[Place] = {(aligned_at[s], None) for s, p in first.items() if aligned_at[s] != p}
     order = {name: i for i, name in enumerate(session.postures)}
-    return sorted(places, key=lambda place: (order[place[0]], place[1] or ""))
+    return sorted(_places(unguided) | aligned, key=lambda place: (order[place[0]], place[1] or ""))
 
 
 def find_approaches(session: Session, places: Sequence[Place]) -> Approaches:

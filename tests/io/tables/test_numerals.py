@@ -6,7 +6,8 @@ from decimal import Decimal
 
 import pytest
 
-from orthocal.io.tables.numerals import Numeral, infer_decimal_sign, is_missing, parse_numeral
+from orthocal.errors import SessionError
+from orthocal.io.tables.numerals import Numeral, decide_decimal_sign, is_missing, parse_numeral
 
 CASES = {
     # text: with a decimal point, with a decimal comma
@@ -80,10 +81,16 @@ def test_value_with_either_decimal_sign(text):
     ],
 )
 def test_decimal_sign_of_a_table(texts, expected):
-    decimal = infer_decimal_sign([Numeral(text, at) for at, text in enumerate(texts)])
-    evidence, rival = decimal.evidence, getattr(decimal, "rival", None)
-    found = getattr(decimal, "sign", None), evidence and evidence.text, rival and rival.text
-    assert found == expected
+    sign, evidence, rival = expected
+    numerals = [Numeral(text, at) for at, text in enumerate(texts)]
+    options = {"standard": False, "advice": "state it", "place": texts.__getitem__}
+    if sign is not None:
+        decided = decide_decimal_sign(numerals, **options)
+        assert (decided.sign, decided.evidence and decided.evidence.text) == (sign, evidence)
+        return
+    with pytest.raises(SessionError, match=evidence or "state it") as raised:
+        decide_decimal_sign(numerals, **options)
+    assert raised.value.where == rival
 
 
 @pytest.mark.parametrize("text", ["", " ", "-", "–", "---", "n/a", "#N/A", "NaN", "k.A.", "…"])
