@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -137,6 +138,15 @@ def marked_reports():
     from orthocal.output.report import page
 
     with patch.object(page, "build_report", lambda *_, **__: "<html></html>"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def assessed_once():
+    """A calibration without an assessment, which several texts state, is assessed once."""
+    from orthocal.assessment import assess
+
+    with patch.object(assess, "assess", cache(assess.assess)):
         yield
 
 

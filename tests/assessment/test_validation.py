@@ -52,6 +52,8 @@ from orthocal.observation.observations import build_observations
 from orthocal.output.text.summary import result_json
 from orthocal.statistics.chance import BY_CHANCE
 
+pytestmark = pytest.mark.usefixtures("assessed_once")
+
 QUICK = {"solver": "variable-projection"}
 
 MACHINES = 25
