@@ -178,7 +178,7 @@ def no_sensor_gains():
 @contextmanager
 def plans_of_few_candidates():
     """Plans of commands with few candidates and one start; tests/planning verify plans."""
-    from uncompared import few_machines, uncompared
+    from uncompared import few_balls, few_machines, uncompared
 
     from orthocal.planning import tool_candidates
 
@@ -189,7 +189,7 @@ def plans_of_few_candidates():
     with (
         patch.object(orthocal, "Equipment", lambda **stated: equipment(**stated | FEW)),
         patch.object(orthocal, "plan_readings", plan_readings),
-        patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:2]),
+        few_balls(2),
         patch.object(tool_candidates, "BED_POINTS", 5),
         uncompared(),
         few_machines(),

@@ -5,9 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from contextlib import contextmanager
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from commands import run_orthocal
 from machines import frame_pose, frames
 from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
-from uncompared import few_machines, uncompared
+from uncompared import few_balls, few_machines, uncompared
 
 from orthocal import (
     load_plan,
@@ -77,13 +75,6 @@ BLOCK = SQUARE.replace(
 PROBE = "sensor: probe\nsigma_mm: 0.01\n"
 TRACKER = "sensor: points\nsigma_mm: 0.01\ntarget_mm: [0, 0, -40]\n"
 CORRELATED = "covariance_um2: [[90, 40, 0], [40, 60, 0], [0, 0, 400]]\n"
-
-
-@contextmanager
-def few_balls(count):
-    """Some of the positions of a fixed ball."""
-    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:count]):
-        yield
 
 
 @pytest.fixture(scope="module")
