@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -263,11 +263,8 @@ class _Search:
     def _without_offsets(self, field: Array) -> Array:
         """Field after alignment and with the best offsets, shape (3 K, ...) of (K, 3, ...), [m]."""
         weighted, offset_effects = weighted_fields(self.tool, field), self._offset_effects
-        if not offset_effects[0].size:
-            return weighted[0]
-        return np.asarray(
-            weighted[0] - offset_effects[0] @ solve_in_order(*offset_effects, *weighted)
-        )
+        offsets = solve_in_order(*offset_effects, *weighted)
+        return np.asarray(weighted[0] - offset_effects[0] @ offsets)
 
     def named(self, amounts: Array) -> dict[str, float]:
         """Adjustment to its amount, [m], for amounts that are not 0."""
@@ -395,9 +392,7 @@ class _Search:
         """
         if not chosen:
             return ()
-        uncertainty: Mapping[int, float] = dict(
-            zip(chosen, self.uncertainties(chosen).tolist(), strict=True)
-        )
+        uncertainty = dict(zip(chosen, self.uncertainties(chosen).tolist(), strict=True))
         pending = [i for i in chosen if amounts[i] != 0.0]
         amounts_set, planned, shown = np.zeros_like(amounts), [], before
         while pending:

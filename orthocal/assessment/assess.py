@@ -231,9 +231,22 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
         no_anomaly = words.no_anomaly(count_readings(session), within_tolerances=within)
         findings = rank([*findings, no_anomaly])
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
-    action = describe_actions(findings) or lead.action
-    headline = words.SESSION_HEADLINES[judgement.verdict]
-    return Assessment(Decision(judgement.verdict, headline, lead.text, action), findings, (), None)
+    return assess_readings(findings, lead)
+
+
+def assess_readings(
+    findings: tuple[Finding, ...], lead: Finding, tool: ToolErrorSummary | None = None
+) -> Assessment:
+    """Assessment of readings, without values to enter.
+
+    Args:
+        findings: All findings.
+        lead: Finding that the decision quotes.
+        tool: Expected tool error; None if unknown.
+    """
+    verdict, action = verdict_of(findings), describe_actions(findings) or lead.action
+    decision = Decision(verdict, words.SESSION_HEADLINES[verdict], lead.text, action)
+    return Assessment(decision, findings, (), tool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -425,14 +438,12 @@ def _decide(
     headlines = words.FIRMWARE_HEADLINES if firmware else words.HEADLINES
     if verdict != "enter":
         return Decision(verdict, headlines[verdict], lead.text, describe_actions(findings))
-    for kind, headline in KEEPING.items():
-        finding = first_of(findings, kind)
-        if finding is not None and firmware:
-            return Decision(verdict, words.FIRMWARE_KEEP_HEADLINE, finding.text, finding.action)
-        if finding is not None:
-            if backlash:
-                headline = f"{headline} {words.BACKLASH_HEADLINE}"
-            return Decision(verdict, headline, finding.text, finding.action)
+    kept = next(filter(None, (first_of(findings, kind) for kind in KEEPING)), None)
+    if kept is not None:
+        headline = words.FIRMWARE_KEEP_HEADLINE if firmware else KEEPING[kept.kind]
+        if backlash and not firmware:
+            headline = f"{headline} {words.BACKLASH_HEADLINE}"
+        return Decision(verdict, headline, kept.text, kept.action)
     explanation = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if explanation is None else (explanation.text, explanation.action)
     if firmware:

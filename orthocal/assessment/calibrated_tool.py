@@ -88,17 +88,12 @@ class CalibratedTool:
 
     def deviation_ignoring_conditions(self) -> Array:
         """Tool error if all errors are corrected for `UseConditions()`, shape (C K, 3), [m]."""
-        closure, points = self.closure_of_reference, self.workspace.points[: len(self.drives)]
-        commanded, passive = closure.reach(points)
-        reached = closure.tcp(commanded, passive)
+        closure = self.sensitivities[0].closure
+        reference = LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
+        commanded, passive = reference.reach(self.workspace.points[: len(self.drives)])
+        reached = reference.tcp(commanded, passive)
         commanded = commanded + self.trims - self.trims_unstated
         return self._place(commanded, None) - np.tile(reached, (self.use.size, 1))
-
-    @property
-    def closure_of_reference(self) -> LoopClosure:
-        """Closures of the machine under the reference conditions, `UseConditions()`."""
-        closure = self.sensitivities[0].closure
-        return LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
 
     def _place(self, commanded: Array, names: Sequence[str] | None) -> Array:
         """Tool positions under each of the conditions, shape (C K, 3), [m].
@@ -144,20 +139,20 @@ def find_tool(calibration: Calibration, use: UseSamples | None = None) -> Calibr
     if not robot.commands_tool:
         return None
     use = sample_use(robot) if use is None else use
-    sensitivities = _sensitivities(calibration, use)
+    closure = LoopClosure(robot, fixed=calibration.errors, conditions=use.conditions[0])
     identified_offsets = calibration.offsets
 
     def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         for offsets in (calibration.active_offsets, identified_offsets):
             require_travel(robot, drives - offsets)
-            sensitivities[0].closure.forward(drives - offsets, start=passive)
+            closure.forward(drives - offsets, start=passive)
 
     try:
         workspace = find_workspace(robot, require_reach)
     except ClosureError:
         return None
-    return _place(calibration, workspace, use, sensitivities)
+    return _place(calibration, workspace, use)
 
 
 def place_tool(
@@ -181,31 +176,28 @@ def place_tool(
     """
     point_names = names or [f"point {i + 1}" for i in range(len(workspace.points))]
     samples = sample_use(calibration.robot) if use is None else use
-    sensitivities = _sensitivities(calibration, samples)
-    return _place(calibration, workspace, samples, sensitivities, point_names)
-
-
-def _sensitivities(calibration: Calibration, use: UseSamples) -> tuple[ToolSensitivity, ...]:
-    """Sensitivity of the tool to free parameters, unmodelled errors and the remaining offsets."""
-    robot, errors = calibration.robot, calibration.errors
-    free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
-    is_offset = [row.any() for row in calibration.offset_weights]
-    offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, is_offset, strict=True) if has]
-    free += [n for n in offsets if n not in free]
-    return tuple(
-        ToolSensitivity(robot, free=free, values=errors, conditions=c) for c in use.conditions
-    )
+    return _place(calibration, workspace, samples, point_names)
 
 
 def _place(
     calibration: Calibration,
     workspace: Workspace,
     use: UseSamples,
-    sensitivities: tuple[ToolSensitivity, ...],
     names: Sequence[str] | None = None,
 ) -> CalibratedTool:
-    """Tool at the points of a workspace; arguments as for `place_tool`."""
-    nominal = nominal_closure(calibration.robot)
+    """Tool at the points of a workspace; arguments as for `place_tool`.
+
+    It is differentiated by free parameters, unmodelled errors and the remaining offsets.
+    """
+    robot, errors = calibration.robot, calibration.errors
+    free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
+    is_offset = [row.any() for row in calibration.offset_weights]
+    offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, is_offset, strict=True) if has]
+    free += [n for n in offsets if n not in free]
+    sensitivities = tuple(
+        ToolSensitivity(robot, free=free, values=errors, conditions=c) for c in use.conditions
+    )
+    nominal = nominal_closure(robot)
     drives, passive = nominal.reach(workspace.points, names=names)
     commanded = drives - calibration.active_offsets
     jacobians = []

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, get_args
 
 from orthocal.arguments import require_names
-from orthocal.assessment.assess import assess
+from orthocal.assessment.assess import assess, assess_readings
 from orthocal.assessment.effect_comparison import EffectComparison, compare_effects
 from orthocal.assessment.judgement import Judgement, judgement_of, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import comparison as words
-from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
-from orthocal.calibration.assessment_record import Assessment, Decision, Finding, NoiseKind
+from orthocal.calibration.assessment_record import Assessment, Finding, NoiseKind
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
@@ -71,10 +69,7 @@ class Comparison:
         return any(r.model == model for r in self.results)
 
     def __getitem__(self, model: str) -> ModelResult:
-        for result in self.results:
-            if result.model == model:
-                return result
-        raise KeyError(model)
+        return {r.model: r for r in self.results}[model]
 
     @property
     def best(self) -> ModelResult | None:
@@ -86,8 +81,31 @@ class Comparison:
 
     @property
     def assessment(self) -> Assessment:
-        """Judgement of the readings, with the findings of the comparison."""
-        return _assess(self)
+        """Judgement of the readings, and findings about the models.
+
+        Unless the verdict is `enter`, it contains the judgement alone.
+        """
+        judgement, best, recommendation = self.judgement, self.best, self.recommendation
+        if recommendation is None:
+            return assess_readings(judgement.findings, judgement.findings[0])
+        notes = words.describe_recommendation(
+            recommendation, judged_scale=judgement.tolerance_scale.factor
+        )
+        notes += [words.not_determined(u.model, u.reason) for u in self.undetermined]
+        if self.effects is not None:
+            notes += words.describe_effects(self.effects, len(self.labels))
+        tool = None
+        if best is not None:
+            assessment = self.assessments[self.results.index(best)]
+            tool = assessment.tool
+            notes += _models_not_recommended(recommendation, self.results, best)
+            notes += assessment.of_kind(*get_args(NoiseKind))
+            if self.repetition is not None:
+                notes.append(describe_repetition(self.repetition, title=self.repeat_title))
+            notes += assessment.of_kind("tool error", "out of reach")
+            if best.linearisation_cost is not None:
+                notes.append(words.linearisation_cost(best.linearisation_cost.rms))
+        return assess_readings(rank([*judgement.findings, *notes]), notes[0], tool)
 
     def to_json(self) -> str:
         """Comparison as a JSON document, SI units."""
@@ -101,10 +119,7 @@ class Comparison:
             ],
             "independent_readings": self.independent,
             "models": [_result_document(r) for r in self.results],
-            "undetermined": [
-                {"model": u.model, "n_free": u.n_free, "reason": u.reason}
-                for u in self.undetermined
-            ],
+            "undetermined": [asdict(u) for u in self.undetermined],
             "repetition": None if self.repetition is None else self.repetition.to_document(),
             "recommendation": recommendation
             and {
@@ -237,57 +252,14 @@ def _score_with_prior(
 
     Larger models always have a prior, so a small model that lacks one would be at a disadvantage.
     """
-    problem = build()
+    try:
+        return score_model(build(), noises=noises, options=options)
+    except NotIdentifiableError:
+        problem = build(prior=True)
     try:
         return score_model(problem, noises=noises, options=options)
-    except NotIdentifiableError:
-        with_prior = build(prior=True)
-    try:
-        return score_model(with_prior, noises=noises, options=options)
     except NotIdentifiableError as e:
         return Undetermined(problem.selection.label, problem.n_machine, e.problem)
-
-
-def _assess(comparison: Comparison) -> Assessment:
-    """Assessment of a comparison: judgement of the readings and findings about the models.
-
-    Unless the verdict is `enter`, it contains the judgement alone.
-    """
-    judgement, best = comparison.judgement, comparison.best
-    recommendation = comparison.recommendation
-    if recommendation is None:
-        lead = judgement.findings[0]
-        headline = SESSION_HEADLINES[judgement.verdict]
-        action = describe_actions(judgement.findings)
-        decision = Decision(judgement.verdict, headline, lead.text, action)
-        return Assessment(decision, judgement.findings, (), None)
-    notes = words.describe_recommendation(
-        recommendation, judged_scale=judgement.tolerance_scale.factor
-    )
-    notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
-    if comparison.effects is not None:
-        notes += words.describe_effects(comparison.effects, len(comparison.labels))
-    tool = None
-    if best is not None:
-        best_assessment = comparison.assessments[comparison.results.index(best)]
-        notes += _models_not_recommended(recommendation, comparison.results, best)
-        notes += best_assessment.of_kind(*get_args(NoiseKind))
-        if comparison.repetition is not None:
-            title = comparison.repeat_title
-            notes.append(describe_repetition(comparison.repetition, title=title))
-        tool = best_assessment.tool
-        notes += best_assessment.of_kind("tool error", "out of reach")
-        if best.linearisation_cost is not None:
-            notes.append(words.linearisation_cost(best.linearisation_cost.rms))
-    findings = rank([*judgement.findings, *notes])
-    lead = next((f for f in findings if f.severity != "note"), notes[0])
-    headline = SESSION_HEADLINES[judgement.verdict]
-    return Assessment(
-        Decision(judgement.verdict, headline, lead.text, lead.action),
-        findings,
-        (),
-        tool,
-    )
 
 
 def _models_not_recommended(

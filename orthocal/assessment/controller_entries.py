@@ -26,7 +26,6 @@ from orthocal.calibration.records import ParameterEstimate
 from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.screw import SCREW_COMPONENTS, Screw
-from orthocal.io.fields import read_only
 from orthocal.robot.model import Robot
 
 ALIGNED_SHARE = 1e-2
@@ -115,11 +114,8 @@ def compute_backlash(
         estimate = by_name.get(name)
         if estimate is None or not (estimate.free or estimate.value):
             continue
-        value, std = max(estimate.value, 0.0), estimate.std if estimate.free else 0.0
-        std_scatter = estimate.std_scatter if estimate.free else 0.0
-        entry = BacklashEntry(
-            drive.name, drive.unit, active_backlash, value, value, std, std_scatter
-        )
+        value, stds = max(estimate.value, 0.0), (estimate.std, estimate.std_scatter)
+        entry = BacklashEntry(drive.name, drive.unit, active_backlash, value, value, *stds)
         uncertainty = expanded_uncertainty(calibration, entry)
         determined = max(value, abs(value - active_backlash)) > uncertainty
         entries.append(entry)
@@ -365,9 +361,8 @@ def compute_entries(
     if calibration.only_offsets:
         tool = None
     if tool is not None:
-        chosen = choose_offsets(tool, enter, drives=list(parameters_of_drive))
-        enter = chosen.offsets
-        stds = propagate_stds(chosen.gain[:, : len(covariances[0])], covariances)
+        enter, gain = choose_offsets(tool, enter, drives=list(parameters_of_drive))
+        stds = propagate_stds(gain[:, : len(covariances[0])], covariances)
     active = calibration.session.controller_offsets
     return tuple(
         ControllerEntry(
@@ -395,18 +390,9 @@ def _reason_held(p: ParameterEstimate) -> Literal["known", "lower bound", "upper
     return "lower bound" if p.at_bound == "lower" else "upper bound"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BestOffsets:
-    """Offsets with the least tool error if the controller corrects nothing else."""
-
-    offsets: Array
-    """Offsets, shape (n_drives,), [m, rad]."""
-    gain: Array
-    """Derivative of the offsets with respect to the parameters, shape (n_drives, n_parameters),
-    [SI]."""
-
-
-def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int]) -> BestOffsets:
+def choose_offsets(
+    tool: CalibratedTool, start: Array, *, drives: Sequence[int]
+) -> tuple[Array, Array]:
     """Offsets with the least tool error after alignment of the workpiece.
 
     Combinations of offsets that mainly translate and rotate the workspace are determined by the
@@ -416,6 +402,10 @@ def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int])
         tool: Tool of the calibrated machine; its parameters contain the offsets of the drives.
         start: Initial offsets, shape (n_drives,), [m, rad].
         drives: Indices of the drives whose offsets are chosen; the others are fixed.
+
+    Returns:
+        Offsets, shape (n_drives,), [m, rad], and their derivative with respect to the parameters,
+        shape (n_drives, n_parameters), [SI].
 
     Raises:
         ClosureError: If the machine cannot reach a point with such offsets.
@@ -433,7 +423,7 @@ def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int])
         offsets[rows] += step
         if np.abs(step).max() < STEP_TOLERANCE:
             break
-    return BestOffsets(read_only(offsets), read_only(gain))
+    return offsets, gain
 
 
 def weighted_fields(tool: CalibratedTool, field: Array) -> tuple[Array, Array]:
@@ -451,7 +441,7 @@ def weighted_fields(tool: CalibratedTool, field: Array) -> tuple[Array, Array]:
     roots = np.sqrt(tool.workspace.weights)[:, None]
     fields = (tool.workspace.remove_motion(field, tool.targets), field)
     aligned, absolute = (
-        (roots * f.reshape(len(roots), -1)).reshape(-1, *field.shape[2:]) for f in fields
+        (roots * f.reshape(len(roots), -1)).reshape(3 * len(roots), *f.shape[2:]) for f in fields
     )
     return aligned, absolute
 

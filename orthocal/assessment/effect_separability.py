@@ -19,6 +19,7 @@ import numpy as np
 
 from orthocal.arrays import Array, Indices
 from orthocal.assessment.effect_limits import find_limits, parameter_units
+from orthocal.assessment.wording import lines_in_file
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.loading import (
@@ -65,11 +66,10 @@ def _incomplete_conditions(session: Session) -> Iterator[Finding]:
         for condition in (c for c in COLUMNS_OF_CONDITIONS if c in effect.conditions):
             missing = readings_without(session, condition)
             if missing and (explicit or len(missing) < len(session.readings)):
-                one_file = len({r.file for r in missing}) == 1
                 yield words.condition_incomplete(
                     effect,
                     condition,
-                    sorted({r.line for r in missing if r.line is not None}) if one_file else [],
+                    lines_in_file(missing),
                     count_readings(session, missing),
                     count_readings(session),
                     two_postures=any(r.minus for r in missing),
@@ -134,28 +134,22 @@ def _inseparable(session: Session) -> Iterator[Finding]:
     model = linear_model(session)
     linearisation = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
-    indices_of_effects = {}
-    for name, effect in effects.items():
-        members = parameter_units(effect, session)
-        indices_of_effects[name] = [i for i, n in enumerate(model.problem.free) if n in members]
-    effect_columns = [i for indices in indices_of_effects.values() for i in indices]
-    effect_slopes, other_slopes = (
-        linearisation.jacobian[:, effect_columns],
-        np.delete(linearisation.jacobian, effect_columns, axis=1),
-    )
+    members = {name: parameter_units(effect, session) for name, effect in effects.items()}
+    free = list(enumerate(model.problem.free))
+    effect_columns = [i for names in members.values() for i, n in free if n in names]
+    labels = [model.problem.free[i] for i in effect_columns]
+    effect_slopes = linearisation.jacobian[:, effect_columns]
+    other_slopes = np.delete(linearisation.jacobian, effect_columns, axis=1)
     normal = other_slopes.T @ other_slopes + model.sigma**2 * np.eye(other_slopes.shape[1])
     whitened = effect_slopes - other_slopes @ np.linalg.solve(
         normal, other_slopes.T @ effect_slopes
     )
     information = effect_slopes.T @ whitened / model.sigma**2
-    position = {i: k for k, i in enumerate(effect_columns)}
+    visible = np.diag(information) > MIN_INFORMATION
     shown = {
-        name: np.array(
-            [k for k in (position[i] for i in indices) if information[k, k] > MIN_INFORMATION], int
-        )
-        for name, indices in indices_of_effects.items()
+        name: np.array([k for k, n in enumerate(labels) if n in names and visible[k]], int)
+        for name, names in members.items()
     }
-    labels = [model.problem.free[i] for i in effect_columns]
     for one, other in combinations_with_replacement(shown, 2):
         pairs = _explained(information, shown[one], shown[other], same=one == other)
         if pairs:

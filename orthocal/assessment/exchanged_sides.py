@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from orthocal.assessment.recommendation import weigh_scales
+from orthocal.assessment.wording import lines_in_file
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding
@@ -97,7 +98,7 @@ def find_exchanged_sides(session: Session) -> tuple[Finding, ...]:
         if rows:
             findings.append(
                 words.exchanged_sides(
-                    [line for i in rows if (line := part.readings[i].line) is not None],
+                    lines_in_file([part.readings[i] for i in rows]),
                     exchanged,
                     [place_of(part, i) for i in rows[:MAX_PLACES]],
                 )
@@ -136,22 +137,16 @@ def _evidence_of_exchange(session: Session) -> Callable[[Iterable[str]], float] 
         return None
     columns = [problem.free.index(name) for name in backlashes]
     about = model.most_likely(session.values)
-    jacobian = (about.likelihood.directions.T * about.singular_values) @ about.error_directions.T
+    stated = about.likelihood
+    jacobian = (stated.directions.T * stated.singular_values) @ stated.errors.T
     setup_of_entry = np.array(list(session.setups))[problem.observations.setup]
 
     def log_evidence(exchanged: Iterable[str]) -> float:
         signed = jacobian.copy()
         rows = np.flatnonzero(np.isin(setup_of_entry, list(exchanged)))
         signed[np.ix_(rows, np.array(columns))] *= -1.0
-        likelihood, error_directions, singular_values = build_likelihood(
-            signed, sigma=model.sigma, dof=model.dof, stated=model.stated
-        )
-        exchange = replace(
-            about,
-            likelihood=likelihood,
-            error_directions=error_directions,
-            singular_values=singular_values,
-        )
+        likelihood = build_likelihood(signed, sigma=model.sigma, dof=model.dof, stated=model.stated)
+        exchange = replace(about, likelihood=likelihood)
         by_scale = weigh_scales(model, exchange, session.values, SCALE_NODES)
         return float(log_of_sum(by_scale + log_normal(SCALE_NODES, TOLERANCE_SCALE_SPREAD)))
 

@@ -90,16 +90,6 @@ class Judgement:
         """Verdict of the gravest finding."""
         return verdict_of(self.findings)
 
-    def require_of(self, session: Session) -> None:
-        """Refuse to use the judgement for other readings.
-
-        Raises:
-            ValueError: If the session has other readings.
-        """
-        values = self.values
-        if values is not None and not np.array_equal(values, session.values, equal_nan=True):
-            raise ValueError("judgement: found one of other readings; expected that of the session")
-
 
 def judgement_of(session: Session, judgement: Judgement | None) -> Judgement:
     """Judgement of a session: the one that was computed already, or a new one.
@@ -112,7 +102,9 @@ def judgement_of(session: Session, judgement: Judgement | None) -> Judgement:
     if judgement is None:
         return judge_session(session)
     require_kind(judgement, Judgement, expected="a Judgement, as judge_session returns")
-    judgement.require_of(session)
+    values = judgement.values
+    if values is not None and not np.array_equal(values, session.values, equal_nan=True):
+        raise ValueError("judgement: found one of other readings; expected that of the session")
     return judgement
 
 
@@ -338,11 +330,11 @@ def _independent_contrasts(
         errors of the machine at their tolerances add, shape (n,); the sum of squares of components
         that no error affects, relative to the noise; the degrees of freedom of both together.
     """
-    directions, problem = linearisation.likelihood.directions, model.problem
-    components = directions @ deviation
+    likelihood, problem = linearisation.likelihood, model.problem
+    components = likelihood.directions @ deviation
     rest_square = max(float(deviation @ deviation - components @ components), 0.0) / noise**2
     # derivatives of the components with respect to the errors, in prior standard deviations
-    slopes = linearisation.singular_values[:, None] * linearisation.error_directions.T / noise
+    slopes = likelihood.singular_values[:, None] * likelihood.errors.T / noise
     parameters, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
     names = problem.free[:n]

@@ -88,11 +88,9 @@ def find_implausible(session: Session, *, explained: bool = False) -> tuple[Find
     """
     findings: list[Finding | None] = [_legs(session.robot)]
     for part in split_sessions(session):
-        has_offsets = "offsets" in part.robot.parameters.models
-        problem = build_problem(part, model="offsets") if has_offsets else None
         findings += [_check_distances(part), *(() if explained else find_finer(part))]
-        if problem is not None and part.readings:
-            findings += _by_model(part, problem, fit=not explained)
+        if "offsets" in part.robot.parameters.models and part.readings:
+            findings += _by_model(part, fit=not explained)
     return tuple(f for f in findings if f is not None)
 
 
@@ -226,10 +224,9 @@ def are_finer(values: ArrayLike, gauge: Gauge) -> NDArray[np.bool_]:
     return np.asarray(np.abs(steps - np.round(steps)) > STEP_TOLERANCE)
 
 
-def _by_model(
-    session: Session, problem: CalibrationProblem, *, fit: bool
-) -> Iterator[Finding | None]:
+def _by_model(session: Session, *, fit: bool) -> Iterator[Finding | None]:
     """Findings about deviations before a fit, and about residuals of a fit of offsets."""
+    problem = build_problem(session, model="offsets")
     try:
         yield _dimensions(session, problem)
         if not fit or len(session.gauges_with_readings) > 1:
@@ -310,7 +307,10 @@ def _check_distances(session: Session) -> Finding | None:
         return None
     units = [d.unit for d in session.robot.drives]
     columns = {u: [unit == u for unit in units] for u in units}
-    spans = {u: _largest_distance(coordinates[:, c]) for u, c in columns.items()}
+    # diagonals of the box around the postures
+    spans = {
+        u: float(np.linalg.norm(np.ptp(coordinates[:, c], axis=0))) for u, c in columns.items()
+    }
     scale = np.array([spans[u] or 1.0 for u in units])  # drives in mm and in deg are comparable
     neighbours, distances = _nearest(coordinates / scale)
     zero = session.robot.drive_zero - session.active_offsets
@@ -323,11 +323,6 @@ def _check_distances(session: Session) -> Finding | None:
     gap = coordinates[last] - coordinates[neighbours[last]]
     gaps = {u: (float(np.linalg.norm(gap[c])), spans[u]) for u, c in columns.items()}
     return words.postures_too_near(name, gaps)
-
-
-def _largest_distance(points: Array) -> float:
-    """Diagonal of the box around points, shape (n, n_drives)."""
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _nearest(points: Array) -> tuple[Indices, Array]:
@@ -344,7 +339,7 @@ def _nearest(points: Array) -> tuple[Indices, Array]:
 
 def _legs(robot: Robot) -> Finding | None:
     """Finding about legs of different nominal lengths on a machine with equal drives."""
-    lengths = _lengths(robot)
+    lengths = {name: leg.length for name, leg in robot.legs.items()}
     drives = {(d.unit, d.zero, d.lower, d.upper) for d in robot.drives}
     if len(lengths) < 2 or len(drives) > 1:
         return None
@@ -355,13 +350,9 @@ def _legs(robot: Robot) -> Finding | None:
     return words.legs_differ(describe_legs(robot), lengths)
 
 
-def _lengths(robot: Robot) -> dict[str, float]:
-    return {name: leg.length for name, leg in robot.legs.items()}
-
-
 def describe_legs(robot: Robot) -> str:
     """Lengths of legs in words, such as "legs of 310.25 mm"; "rods of ..." on a linear delta."""
-    shown = {name: f"{length / MM:g}" for name, length in _lengths(robot).items()}
+    shown = {name: f"{leg.length / MM:g}" for name, leg in robot.legs.items()}
     if len(set(shown.values())) == 1:
         return f"{robot.leg_noun} of {next(iter(shown.values()))} mm"
     return f"{robot.leg_noun} of {', '.join(f'{n} {v}' for n, v in shown.items())} mm"

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +27,6 @@ from orthocal.calibration.refit import (
     restore_mounting_covariance,
 )
 from orthocal.errors import ClosureError
-from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
 from orthocal.observation.gauge_noise import noise_floor
 from orthocal.observation.observations import Observations
@@ -82,20 +80,20 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
         fit: Fit of the same parameters to the new session.
     """
     problem = fit.problem
-    noise = _predict_noise(calibration, fit)
+    sigma, noise_dof = _predict_noise(calibration, fit)
     dof = problem.observations.size - problem.observations.n_free_zeros
-    if not (np.all(noise.sigma > 0.0) and noise.dof > 0.0 and dof > 0):
+    if not (np.all(sigma > 0.0) and noise_dof > 0.0 and dof > 0):
         return DeviationTest(math.nan, math.nan)
     root = _root_of_covariance(calibration, fit)
     centre, known = problem.prior_mean.copy(), known_parameters(calibration, problem)[0]
     centre[known] = calibrated_theta(calibration, fit)[known]
-    square, worst_setup = _least_square(fit, centre, root, noise.sigma)
+    square, worst_setup = _least_square(fit, centre, root, sigma)
 
     def p_value(factor: float) -> float:
         scaled = square * factor**2
-        if math.isinf(noise.dof):
+        if math.isinf(noise_dof):
             return chi_square_tail(dof, scaled)
-        return f_tail(dof, noise.dof, scaled / dof)
+        return f_tail(dof, noise_dof, scaled / dof)
 
     critical_factor = least_number(lambda f: p_value(f) < BY_CHANCE) if square > 0.0 else math.nan
     return DeviationTest(p_value(1.0), critical_factor, worst_setup)
@@ -122,23 +120,17 @@ def _root_of_covariance(calibration: Calibration, fit: Fit) -> Array:
     return square_root(covariance)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PredictedNoise:
-    """Noise of new readings, predicted by a calibration."""
-
-    sigma: Array
-    """Standard deviation of each entry, shape (n_entries,), [m]; NaN if unknown."""
-    dof: float
-    """Degrees of freedom."""
-
-
-def _predict_noise(calibration: Calibration, fit: Fit) -> _PredictedNoise:
+def _predict_noise(calibration: Calibration, fit: Fit) -> tuple[Array, float]:
     """Noise of the readings of a new session.
 
     That of a gauge of the calibration is as estimated there. It contains unmodelled errors, without
     priors always the residuals. Another gauge has its stated noise and the same unmodelled errors.
     Degrees of freedom of several gauges are combined as Satterthwaite (1946) does. A noise that
     gauges share counts once.
+
+    Returns:
+        Standard deviation of each entry, shape (n_entries,), [m], NaN if unknown; and its degrees
+        of freedom.
     """
     sigma, inverse_dof = np.empty(fit.problem.observations.size), 0.0
     by_residuals = True
@@ -168,7 +160,7 @@ def _predict_noise(calibration: Calibration, fit: Fit) -> _PredictedNoise:
         sigma[group.entries] = math.sqrt(variance)
         inverse_dof += float(np.mean(group.entries)) ** 2 / dof if dof > 0.0 else math.inf
     dof = 1.0 / inverse_dof if inverse_dof else math.inf
-    return _PredictedNoise(sigma, min(dof, calibration.noise.residual_dof) if by_residuals else dof)
+    return sigma, min(dof, calibration.noise.residual_dof) if by_residuals else dof
 
 
 def _of_calibration(calibration: Calibration, gauge: GaugeRecord) -> tuple[float, float]:
@@ -278,7 +270,7 @@ def expect_deviations(calibration: Calibration, fit: Fit) -> ExpectedDeviations:
         calibration: The calibration.
         fit: Fit of the same parameters to the new session.
     """
-    noise = _predict_noise(calibration, fit).sigma
+    noise, _ = _predict_noise(calibration, fit)
     if calibration.prior:
         return _expect_with_priors(calibration, fit, noise)
     problem, n = fit.problem, fit.problem.n_machine
@@ -367,39 +359,28 @@ def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
 
     The directions of noise have a uniform distribution in the space of residuals.
     """
-    matched, correlation, cosine = _correlate(first, second)
-    dimensions = matched - len(second.residuals) + second.noise.residual_dof
-    p_value = math.nan
-    if matched >= MIN_ROWS and dimensions > 1.0 and not math.isnan(correlation):
-        tail = 0.5 * (1.0 - incomplete_beta(0.5, 0.5 * (dimensions - 1.0), cosine**2))
-        p_value = tail if cosine > 0.0 else 1.0 - tail
-    return Repetition(matched, correlation, p_value)
-
-
-_Row = tuple[str, str, str | None, str | None]
-"""Setup, posture and subtracted posture by their names in the session, and approach."""
-
-
-def _keyed_rows(calibration: Calibration) -> Iterator[tuple[_Row, ResidualRow]]:
-    """Rows of a calibration with keys that two sessions share."""
-    joined = bool(calibration.session.parts)
-    for r in calibration.residuals:
-        setup, posture = (split_label(n, joined=joined)[1] for n in (r.setup, r.posture))
-        minus = None if r.minus is None else split_label(r.minus, joined=joined)[1]
-        yield (setup, posture, minus, known_approach(r.conditions)), r
-
-
-def _correlate(first: Calibration, second: Calibration) -> tuple[int, float, float]:
-    """Number of shared rows, and correlation and cosine of their residuals averaged over cycles."""
-    means = []
-    for calibration in (first, second):
-        residuals_of_row: dict[_Row, list[float]] = defaultdict(list)
-        for key, r in _keyed_rows(calibration):
-            residuals_of_row[key].append(r.residual)
-        means.append({key: sum(v) / len(v) for key, v in residuals_of_row.items()})
+    means = [_mean_residuals(calibration) for calibration in (first, second)]
     common = [key for key in means[0] if key in means[1]]
     a, b = (np.array([m[key] for key in common]) for m in means)
-    if len(common) < MIN_ROWS or not np.any(a) or not np.any(b):
-        return len(common), math.nan, math.nan
-    cosine = float(a @ b / np.sqrt((a @ a) * (b @ b)))
-    return len(common), float(np.corrcoef(a, b)[0, 1]), cosine
+    correlation = p_value = math.nan
+    if len(common) >= MIN_ROWS and np.any(a) and np.any(b):
+        correlation = float(np.corrcoef(a, b)[0, 1])
+        cosine = float(a @ b / np.sqrt((a @ a) * (b @ b)))
+        dimensions = len(common) - len(second.residuals) + second.noise.residual_dof
+        if dimensions > 1.0 and not math.isnan(correlation):
+            tail = 0.5 * (1.0 - incomplete_beta(0.5, 0.5 * (dimensions - 1.0), cosine**2))
+            p_value = tail if cosine > 0.0 else 1.0 - tail
+    return Repetition(len(common), correlation, p_value)
+
+
+def _mean_residuals(calibration: Calibration) -> dict[tuple[str | None, ...], float]:
+    """Mean residual over the cycles, by the keys of rows that two sessions share, [m].
+
+    A key is the setup, posture and subtracted posture by their names in the session, and approach.
+    """
+    joined = bool(calibration.session.parts)
+    residuals: dict[tuple[str | None, ...], list[float]] = defaultdict(list)
+    for r in calibration.residuals:
+        labels = (n and split_label(n, joined=joined)[1] for n in (r.setup, r.posture, r.minus))
+        residuals[*labels, known_approach(r.conditions)].append(r.residual)
+    return {key: sum(v) / len(v) for key, v in residuals.items()}

@@ -324,7 +324,8 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
     Raises:
         ExportError: If the machine does not reach the points.
     """
-    robot, tool, tilt = calibration.robot, find_tool(calibration), _bed_tilt(calibration, bed)
+    robot, tool = calibration.robot, find_tool(calibration)
+    tilt, rotation_derivative = _find_bed_rotation(calibration, bed)
     if tool is None:
         raise ExportError("the machine does not reach a workspace")
     limits = tool.workspace.limits
@@ -339,7 +340,6 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
         after = assess_placed(calibration, placed, (), ()).after
     except ClosureError as e:
         raise ExportError(f"the calibrated machine does not reach the bed: {e}") from None
-    layer_uncertainty, rotation_derivative = math.nan, _bed_rotation_derivative(calibration, bed)
     to_errors, to_drives = (
         ToolSensitivity(robot, free=names, values=calibration.errors)
         for names in (
@@ -354,6 +354,7 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
         by_bed = -np.einsum("ijk,nj->nik", rotation_derivative, points)
         return _Points(points, carriages, np.concatenate([nozzle, by_bed], axis=2), drives)
 
+    layer_uncertainty = math.nan
     if after is not None:
         layer_uncertainty = math.sqrt(float(after.aligned_covariance[:, 2, 2].mean()))
     targets = _Targets(place(space.points, carriages), space.weights, place(layer, layer_carriages))
@@ -375,33 +376,27 @@ def _find_bed(calibration: Calibration) -> str:
     return beds[-1]
 
 
-def _bed_tilt(calibration: Calibration, bed: str) -> Array:
-    """Rotation from the axes of the bed to those of the machine, shape (3, 3)."""
+def _find_bed_rotation(calibration: Calibration, bed: str) -> tuple[Array, Array]:
+    """Rotation from the axes of the bed to those of the machine, and its derivative.
+
+    Joined logs share roll and yaw of the bed.
+
+    Returns:
+        The rotation, shape (3, 3); and its derivative with respect to nuisance parameters, shape
+        (3, 3, n), [1/rad]. Element i, j, k of this is the change of coordinate i of a point per
+        unit of coordinate j and parameter k.
+    """
     from scipy.spatial.transform import Rotation
 
-    values = {p.name: p.value for p in calibration.sensors}
-    yaw, roll = (values.get(name, 0.0) for name in _tilt_names(calibration, bed))
-    return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
-
-
-def _tilt_names(calibration: Calibration, bed: str) -> tuple[str, str]:
-    """Names of yaw and roll of the bed, which joined logs share."""
     _, shared = split_label(bed, joined=bool(calibration.session.parts))
-    return f"setup.{shared}.yaw", f"setup.{shared}.roll"
-
-
-def _bed_rotation_derivative(calibration: Calibration, bed: str) -> Array:
-    """Derivative of the bed's rotation with respect to nuisance parameters, (3, 3, n), [1/rad].
-
-    Element i, j, k: change of coordinate i of a point per unit of coordinate j and parameter k.
-    """
+    angles = {f"setup.{shared}.{angle}": 0.0 for angle in ("roll", "yaw")}  # about x and y
+    axes = dict(zip(angles, np.eye(3), strict=False))
     derivative = np.zeros((3, 3, len(calibration.sensors)))
-    yaw, roll = _tilt_names(calibration, bed)
-    axes = {roll: [1.0, 0.0, 0.0], yaw: [0.0, 1.0, 0.0]}
-    for k, parameter in enumerate(calibration.sensors):
-        if parameter.name in axes:
-            derivative[:, :, k] = np.cross(axes[parameter.name], np.eye(3)).T
-    return derivative
+    for k, p in enumerate(calibration.sensors):
+        if p.name in angles:
+            angles[p.name] = p.value
+            derivative[:, :, k] = np.cross(axes[p.name], np.eye(3)).T
+    return np.asarray(Rotation.from_euler("xy", [*angles.values()]).as_matrix()), derivative
 
 
 def _layer_points(limits: Array) -> Array:

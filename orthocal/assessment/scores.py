@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,7 +16,6 @@ from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
 from orthocal.estimation.fit import Fit, fit_problem, require_determined
-from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.observation.gauge_noise import SMALLEST_SIGMA
@@ -69,8 +69,6 @@ class ModelResult:
     n_free: int
     effective: float
     """Effective number of parameters."""
-    prior: bool
-    """True if the tolerances are used as a prior."""
     linearised: Score
     exact: Score
     calibration: Calibration
@@ -108,9 +106,10 @@ def score_model(
         ClosureError: If the machine cannot reach a posture.
     """
     fit = fit_problem(problem, options=options)
-    linearisation = fit.linearisation
     calibration = assemble_calibration(fit)
-    tool = _assess_tool(calibration)
+    tool = None
+    with suppress(ClosureError, RobotError):  # no tool, or no reachable workspace
+        tool = assess_tool(calibration)
     effective = fit.information.posterior(
         sigma=fit.sigma, precision=problem.prior_precision, at_bound=fit.at_bound
     ).effective_parameters
@@ -118,35 +117,19 @@ def score_model(
         model=problem.selection.label,
         n_free=problem.n_machine,
         effective=effective,
-        prior=bool(problem.machine_selection.prior.any()),
-        linearised=_score(fit, linearisation, "linearised", noises, effective),
-        exact=_score(fit, linearisation, "exact", noises, effective),
+        linearised=_score(fit, "linearised", noises, effective),
+        exact=_score(fit, "exact", noises, effective),
         calibration=calibration,
         tool=tool,
         linearisation_cost=None if tool is None else _linearisation_cost(fit, tool),
     )
 
 
-def _assess_tool(calibration: Calibration) -> ToolAccuracy | None:
-    """Tool errors; None if they cannot be computed."""
-    try:
-        return assess_tool(calibration)
-    except (ClosureError, RobotError):  # no tool, or no reachable workspace
-        return None
-
-
-def _score(
-    fit: Fit,
-    linearisation: LinearProblem,
-    method: Method,
-    noises: Mapping[str, Noise],
-    effective: float,
-) -> Score:
+def _score(fit: Fit, method: Method, noises: Mapping[str, Noise], effective: float) -> Score:
     """Score of one method.
 
     Args:
         fit: Fit of the model.
-        linearisation: Linearisation of its problem.
         method: The method.
         noises: Known noise of each gauge.
         effective: Effective number of parameters.
@@ -181,7 +164,7 @@ def _score(
         if denominator > 0.0
         else math.inf,
         bic=misfit + k * math.log(count) if count - effective >= 0.5 else math.inf,
-        prediction_error=_cross_validate(fit, linearisation, method),
+        prediction_error=_cross_validate(fit, method),
     )
 
 
@@ -195,7 +178,7 @@ def _chi_square(fit: Fit, errors: Array, noises: Mapping[str, Noise]) -> float:
     return total
 
 
-def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
+def _cross_validate(fit: Fit, method: Method) -> Array:
     """Cross-validation errors as in `Score.prediction_error`."""
     problem, observations = fit.problem, fit.problem.observations
     errors = np.full(observations.plus.size, np.nan)
@@ -206,7 +189,7 @@ def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> A
         entries_left_out = observations.setup == setup
         try:
             if not problem.prior_precision.all():
-                jacobian = np.where(entries_left_out[:, None], 0.0, linearisation.jacobian)
+                jacobian = np.where(entries_left_out[:, None], 0.0, fit.linearisation.jacobian)
                 require_determined(problem, decompose(jacobian, observations))
             if method == "exact":
                 theta = fit.program.solve(
@@ -216,7 +199,7 @@ def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> A
                     excluded=np.flatnonzero(entries_left_out),
                 ).theta
             else:
-                theta = linearisation.solve(sigma=fit.sigma, use=~entries_left_out)
+                theta = fit.linearisation.solve(sigma=fit.sigma, use=~entries_left_out)
             residual = project_out_zeros(problem.values - problem.predict(theta), observations)
         except (NotIdentifiableError, ClosureError, SolverError):
             continue  # errors remain NaN

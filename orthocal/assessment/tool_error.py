@@ -424,8 +424,5 @@ def _sampled_percentile(covariances: Array, workspace: Workspace) -> float:
 
 def _weighted_percentile_95(lengths: Array, weights: Array) -> float:
     """Weighted 95 % quantile."""
-    if weights.min() == weights.max():  # faster, without sorting
-        return float(np.quantile(lengths, 0.95, method="inverted_cdf"))
-    order = np.argsort(lengths)
-    share = np.cumsum(weights[order])
-    return float(lengths[order][min(int(np.searchsorted(share, 0.95)), lengths.size - 1)])
+    differing = None if weights.min() == weights.max() else weights  # equal ones need no sorting
+    return float(np.quantile(lengths, 0.95, method="inverted_cdf", weights=differing))

@@ -238,7 +238,8 @@ def validate_calibration(
     require_calibration(calibration)
     calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new]
-    fit, refit = _refit(calibration, join_sessions(measured))
+    fit = repeat_fit(calibration, join_sessions(measured))
+    refit = assemble_calibration(fit, nominal=calibrated_theta(calibration, fit))
     before = restore_session(calibration)
     all_sessions = join_sessions([before, *measured])
     judgement = judge_session(all_sessions)
@@ -325,15 +326,6 @@ def _apply_stated(
     calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
     _require_new(calibration, restated)
     return calibration, restated
-
-
-def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration]:
-    """Fit and calibration of new readings.
-
-    The nominal readings of the calibration are the predicted ones.
-    """
-    fit = repeat_fit(calibration, session)
-    return fit, assemble_calibration(fit, nominal=calibrated_theta(calibration, fit))
 
 
 def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place, Severity
+from orthocal.session.session import Reading
 from orthocal.text import capitalised, list_some, uncapitalised
 from orthocal.units import MM, UM, format_fixed
 
@@ -114,6 +115,12 @@ def _after_place(finding: Finding) -> str:
 def parameter_places(*names: str) -> tuple[Place, ...]:
     """Places of a finding for the names of parameters or drives."""
     return tuple(Place(parameter=name) for name in names)
+
+
+def lines_in_file(readings: Sequence[Reading | Place]) -> list[int]:
+    """Lines of readings, ascending; none if they are unknown or in several files."""
+    one_file = len({r.file for r in readings}) == 1
+    return sorted({r.line for r in readings if r.line is not None}) if one_file else []
 
 
 def mm(value: float) -> str:

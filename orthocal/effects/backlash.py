@@ -37,7 +37,6 @@ class Backlash(Effect):
     keys = BacklashKeys
     conditions = ("approach",)
 
-    robot: Robot
     errors: tuple[ElementaryError, ...]
     """Backlash of each drive, `<drive>.backlash`, [m, rad]."""
 
@@ -54,7 +53,7 @@ class Backlash(Effect):
             )
             for d in robot.drives
         )
-        return cls(robot, tuple(errors))
+        return cls(tuple(errors))
 
     def describe(self) -> str:
         """Description in a few words."""

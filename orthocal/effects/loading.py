@@ -96,15 +96,17 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
 @lru_cache(maxsize=4 * MAX_LOADED)
 def _choose_effects(robot: Robot, chosen: tuple[str, ...] | None) -> Robot:
     """Robot with ordered names of effects, cached."""
-    plain = replace(robot, chosen_effects=chosen, parameters=ParameterSet())
-    return _add_parameters(plain).with_tolerances(robot.parameters.stated)
+    return _with_parameters(replace(robot, chosen_effects=chosen))
 
 
 def with_adjustments(robot: Robot) -> Robot:
     """Robot whose placements depend on the mechanical adjustments of each session."""
-    if robot.adjusted:
-        return robot
-    plain = replace(robot, adjusted=True, parameters=ParameterSet())
+    return robot if robot.adjusted else _with_parameters(replace(robot, adjusted=True))
+
+
+def _with_parameters(robot: Robot) -> Robot:
+    """Robot with the parameters of its present effects, and the tolerances stated before."""
+    plain = replace(robot, parameters=ParameterSet())
     return _add_parameters(plain).with_tolerances(robot.parameters.stated)
 
 
@@ -193,10 +195,5 @@ def reading_effects(robot: Robot) -> tuple[Effect, ...]:
 
 def _read_tolerances(robot: Robot) -> ToleranceKeys:
     """Tolerances in the robot's YAML."""
-    return validate(
-        ToleranceKeys,
-        robot.declared.tolerances,
-        where=str(robot.yaml),
-        error=RobotError,
-        under="orthocal.tolerances",
-    )
+    where, under, data = str(robot.yaml), "orthocal.tolerances", robot.declared.tolerances
+    return validate(ToleranceKeys, data, where=where, error=RobotError, under=under)

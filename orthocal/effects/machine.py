@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import casadi as ca
 
@@ -20,16 +19,6 @@ from orthocal.effects.rods import stretch_rod
 from orthocal.robot.model import Robot
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MachineExpressions:
-    """Drives and placements of a machine as expressions of errors, commands and conditions."""
-
-    actuated: ca.SX
-    """Actual drive coordinates, shape (n_drives,), [m, rad]."""
-    twists: Mapping[Placement, ca.SX]
-    """Placements on which effects act, mapped to their twist δ, shape (6,), [m, rad]."""
-
-
 def neutral_conditions(robot: Robot) -> dict[Condition, ca.SX]:
     """Neutral values of all conditions, as constants."""
     values = neutral_values(robot)
@@ -39,28 +28,25 @@ def neutral_conditions(robot: Robot) -> dict[Condition, ca.SX]:
 def express_machine(
     robot: Robot,
     commanded: ca.SX,
-    errors: Mapping[str, ca.SX | float],
-    conditions: Mapping[Condition, ca.SX] | None = None,
-) -> MachineExpressions:
+    errors: Symbols,
+    conditions: Mapping[Condition, ca.SX],
+) -> tuple[ca.SX, dict[Placement, ca.SX]]:
     """Drives and placements of a robot with all its effects.
 
     Args:
         robot: The nominal robot.
         commanded: Commanded drive coordinates, shape (n_drives,), [m, rad].
-        errors: Names of parameters, mapped to expressions or numbers, [unit of the parameter]; 0
-            where absent.
-        conditions: Conditions of the posture; neutral where absent.
+        errors: All elementary errors by name, [SI].
+        conditions: All conditions of the posture.
+
+    Returns:
+        Actual drive coordinates, shape (n_drives,), [m, rad]; and the placements on which effects
+        act, mapped to their twist δ, shape (6,), [m, rad].
     """
-    elementary: dict[str, ca.SX] = dict.fromkeys(robot.parameters.elementary, ca.SX(1, 1))
-    for name, value in errors.items():
-        for term, coefficient in robot.parameters[name].terms:
-            part = value if coefficient == 1.0 else coefficient * value  # a product costs time
-            elementary[term] = elementary[term] + part
-    stated = {**neutral_conditions(robot), "coordinates": commanded, **(conditions or {})}
     actuated, twists = commanded, dict[Placement, ca.SX]()
     for effect in reversed(robot_effects(robot)):  # gain and offset of the drives act last
-        parameters = {e.name: elementary[e.name] for e in effect.errors}
-        needed: Symbols = {name: stated[name] for name in effect.conditions}
+        parameters = {e.name: errors[e.name] for e in effect.errors}
+        needed: Symbols = {name: conditions[name] for name in effect.conditions}
         source = type(effect).__qualname__
         moved = effect.drives(actuated, parameters, needed)
         actuated = require_expression(moved, len(robot.drives), f"{source}.drives")
@@ -72,4 +58,4 @@ def express_machine(
             for placement, twist in displacement.items():
                 twist = require_expression(twist, 6, f"{source}.placements")
                 add_twist(twists, placement, twist)
-    return MachineExpressions(actuated, twists)
+    return actuated, twists

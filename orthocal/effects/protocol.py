@@ -15,7 +15,7 @@ An effect may act on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import casadi as ca
 import numpy as np
@@ -48,15 +48,7 @@ Condition = Literal[
   `coordinates` for the mounting of a gauge
 """
 
-NEUTRAL: dict[Condition, float] = {
-    "approach": 0.0,
-    "temperature": 20.0,
-    "time": 0.0,
-    "load": 0.0,
-    "adjustment": 0.0,
-    "coordinates": 0.0,
-    "reference": 0.0,
-}
+NEUTRAL: dict[Condition, float] = dict.fromkeys(get_args(Condition), 0.0) | {"temperature": 20.0}
 """Value of a condition that is not stated. The temperature is that of ISO 1. Without a load the
 machine has no weight, as in the nominal kinematics of the controller. Coordinates that are not
 stated are those of the command."""

@@ -64,10 +64,6 @@ class Fit:
     problem: CalibrationProblem
     program: Program
     """Program that solved it."""
-    seconds_build: float
-    """Time to build the functions and the program, [s]."""
-    seconds_solve: float
-    """Time of all solutions, [s]."""
     iterations: int
     """Iterations of the solver in all solutions."""
     noise_converged: bool
@@ -87,6 +83,10 @@ class Fit:
     """dh/dθ̂ at the solution, shape (n_entries, n_free), [m of the first gauge per prior std]."""
     information: Information
     """Information of the Jacobian."""
+    seconds_build: float = 0.0
+    """Time to build the functions and the program, [s]."""
+    seconds_solve: float = 0.0
+    """Time of all solutions, [s]."""
 
     @property
     def groups(self) -> tuple[GaugeReadings, ...]:
@@ -163,16 +163,11 @@ class Fit:
             separate: Whether residuals do not contribute to the noise (see `covariance`).
         """
         groups, problem = self.groups, self.problem
-        factors = np.array(
-            [
-                coverage_factor(
-                    noise.without_residuals(g.gauge.sigma, g.gauge.resolution)[1]
-                    if separate
-                    else noise.dof
-                )
-                for g, noise in zip(groups, self.noises.gauges, strict=True)
-            ]
-        )
+        dofs = [noise.dof for noise in self.noises.gauges]
+        if separate:
+            gauges = zip((g.gauge for g in groups), self.noises.gauges, strict=True)
+            dofs = [n.without_residuals(g.sigma, g.resolution)[1] for g, n in gauges]
+        factors = np.array([coverage_factor(dof) for dof in dofs])
         if len(groups) == 1:
             return float(factors[0])
         jacobian = project_out_zeros(self.jacobian, problem.observations)
@@ -262,41 +257,10 @@ def fit_problem(
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
-    solved = _solve_with_noise(program, linear, groups, start, rounds=rounds)
-    program, linear, noises = solved.program, solved.linear, solved.evaluation.noises
-    require_assembly(program.problem, solved.solution, options=program.options)
-    sigma = floored_sigma(noises.common)
-    return Fit(
-        problem=program.problem,
-        program=program,
-        seconds_build=built - began,
-        seconds_solve=time.perf_counter() - built,
-        iterations=solved.iterations,
-        noise_converged=solved.converged,
-        linearisation=linear,
-        linearised_theta=linear.solve(sigma=sigma if math.isfinite(sigma) else solved.sigma),
-        solution=solved.solution,
-        noises=noises,
-        prediction=solved.evaluation.prediction,
-        jacobian=solved.evaluation.jacobian,
-        information=solved.evaluation.information,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _NoiseSolution:
-    """Solution, with sigma and the noise ratios of the gauges from its residuals."""
-
-    program: Program
-    linear: LinearProblem
-    solution: Solution
-    evaluation: _Evaluation
-    sigma: float
-    """Sigma with which the last solution was computed, [m]."""
-    iterations: int
-    """Iterations of all solutions."""
-    converged: bool
-    """True if sigma and the noise ratios of the last two solutions agree."""
+    fit = _solve_with_noise(program, linear, groups, start, rounds=rounds)
+    require_assembly(fit.problem, fit.solution, options=program.options)
+    seconds = built - began, time.perf_counter() - built
+    return replace(fit, seconds_build=seconds[0], seconds_solve=seconds[1])
 
 
 def _solve_with_noise(
@@ -306,7 +270,7 @@ def _solve_with_noise(
     start: ArrayLike | None,
     *,
     rounds: int,
-) -> _NoiseSolution:
+) -> Fit:
     """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
     initial = initial_sigmas(problem.session, problem.observations)
@@ -329,23 +293,32 @@ def _solve_with_noise(
         # the better sides of mirrored directions may depend on sigma
         compared = converged or not len(problem.mirrored)
         solution = program.solve(
-            sigma=sigma,
-            start=solution.theta,
-            start_passive=solution.passive,
-            mirrored=compared,
+            sigma=sigma, start=solution.theta, start_passive=solution.passive, mirrored=compared
         )
         iterations += solution.iterations
+    noises = evaluation.noises
     if not math.isfinite(estimated) and _depends_on_sigma(program):
         # the last sigma was that of residuals with too few degrees of freedom
         sigma = float(initial[groups[0].entries][0])
         solution = program.solve(sigma=sigma, start=solution.theta, start_passive=solution.passive)
         iterations += solution.iterations
-        at_assumed = _evaluate(program, solution, sigma, groups, initial)
-        evaluation = replace(at_assumed, noises=evaluation.noises)
+        evaluation = _evaluate(program, solution, sigma, groups, initial)
     if several:  # the noise of each gauge is that of the solution
-        noises = evaluation.noises.with_sigmas(groups, sigma * problem.noise_ratio)
-        evaluation = replace(evaluation, noises=noises)
-    return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
+        noises = noises.with_sigmas(groups, sigma * problem.noise_ratio)
+    known = floored_sigma(noises.common)
+    return Fit(
+        problem=program.problem,
+        program=program,
+        iterations=iterations,
+        noise_converged=converged,
+        linearisation=linear,
+        linearised_theta=linear.solve(sigma=known if math.isfinite(known) else sigma),
+        solution=solution,
+        noises=noises,
+        prediction=evaluation.prediction,
+        jacobian=evaluation.jacobian,
+        information=evaluation.information,
+    )
 
 
 def _solve_first(
@@ -552,7 +525,7 @@ def find_mounting_covariance(
     information: Information,
     *,
     sigma: float,
-    at_bound: Mask | None = None,
+    at_bound: Mask,
 ) -> Array:
     """Part of the covariance of the machine's parameters that is due to nuisance parameters.
 
@@ -570,12 +543,9 @@ def find_mounting_covariance(
         Shape (n_machine, n_machine), [SI].
     """
     n, precision = problem.n_machine, problem.prior_precision
-    at_bound = np.zeros(problem.n_free, dtype=np.bool_) if at_bound is None else at_bound
     total = information.posterior(sigma=sigma, precision=precision, at_bound=at_bound).covariance
-    without_mounting = (
-        assume_others_known(information, n)
-        .posterior(sigma=sigma, precision=precision[:n], at_bound=at_bound[:n])
-        .covariance
+    without_mounting = assume_others_known(information, n).posterior(
+        sigma=sigma, precision=precision[:n], at_bound=at_bound[:n]
     )
     scale = problem.theta_scale[:n]
-    return np.asarray((total[:n, :n] - without_mounting) * np.outer(scale, scale))
+    return np.asarray((total[:n, :n] - without_mounting.covariance) * np.outer(scale, scale))

@@ -111,58 +111,26 @@ def twelve_row_covariance() -> Array:
     return same_setup.astype(np.float64) + np.eye(len(TWELVE_ROWS))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearFit:
-    """Least-squares solution of equation (8)."""
-
-    offsets: Array
-    """Δρ, shape (3,), [m]."""
-    residuals: Array
-    """y − A Δρ, shape (rows,), [m]."""
-    cofactor: Array
-    """(Aᵀ V⁻¹ A)⁻¹, shape (3, 3), [1]; covariance of the offsets divided by `sigma`²."""
-    sigma: float
-    """√(rᵀ V⁻¹ r/dof), with V = I for ordinary least squares, [m]; NaN for dof = 0."""
-    dof: int
-    """Degrees of freedom: rows − 3."""
-
-
-def solve_equation_8(
-    matrix: ArrayLike, differences: ArrayLike, *, covariance: ArrayLike | None = None
-) -> LinearFit:
-    """Solve equation (8) by generalised or ordinary least squares.
+def invert_equation_8(matrix: ArrayLike, *, covariance: ArrayLike | None = None) -> Array:
+    """Matrix G of the least-squares solution Δρ = G y of equation (8), shape (3, rows).
 
     Args:
         matrix: Result of `leg_parallelism_matrix`, shape (rows, 3).
-        differences: Measured differences, shape (rows,), [m].
-        covariance: V, covariance of the rows up to a factor, shape (rows, rows); ordinary least
-            squares by default.
+        covariance: V, covariance of the rows up to a factor, shape (rows, rows), for generalised
+            least squares; ordinary least squares by default.
 
     Raises:
         NotIdentifiableError: If the rows do not determine the three offsets.
     """
     a = np.asarray(matrix, dtype=np.float64)
-    y = np.asarray(differences, dtype=np.float64)
     if np.linalg.matrix_rank(a, rtol=RANK_THRESHOLD) < 3:
         raise NotIdentifiableError(
             "the rows do not determine the three offsets", parameters=("x", "y", "z")
         )
-    whiten: Array = np.eye(len(y))
-    if covariance is not None:
-        factor = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
-        whiten = np.asarray(np.linalg.inv(factor))
-    inverse = np.linalg.pinv(whiten @ a)
-    offsets = inverse @ (whiten @ y)
-    residuals = y - a @ offsets
-    dof = len(y) - 3
-    weighted = whiten @ residuals
-    return LinearFit(
-        offsets=offsets,
-        residuals=residuals,
-        cofactor=inverse @ inverse.T,
-        sigma=float(np.sqrt(weighted @ weighted / dof)) if dof > 0 else float("nan"),
-        dof=dof,
-    )
+    if covariance is None:
+        return np.asarray(np.linalg.pinv(a))
+    whiten = np.linalg.inv(np.linalg.cholesky(np.asarray(covariance, dtype=np.float64)))
+    return np.asarray(np.linalg.pinv(whiten @ a) @ whiten)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

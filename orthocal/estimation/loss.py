@@ -112,10 +112,8 @@ class Loss:
         for _ in range(MAX_CENTRE_STEPS if self.robust else 0):
             residual = values - result[group]
             gradient = sums(self.influence(residual))
-            low, high = (
-                np.where(gradient > 0.0, result, low),
-                np.where(gradient < 0.0, result, high),
-            )
+            low = np.where(gradient > 0.0, result, low)
+            high = np.where(gradient < 0.0, result, high)
             # Newton step if the gradient decreases fast enough, otherwise bisection
             decreasing = np.abs(gradient) < 0.5 * last_gradient
             last_gradient = np.abs(gradient)

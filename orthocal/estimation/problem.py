@@ -231,17 +231,10 @@ class CalibrationProblem:
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
         """
-        start = self._active_passive_or_none if start is None else start
-        return self._close(theta, start, failures)
-
-    def _close(
-        self, theta: ArrayLike, start: Array | None, failures: Failures | None = None
-    ) -> Array:
-        """`close` from the reference posture by default."""
         return self.closure.close(
             self.states.commands,
             theta=self._of_machine(theta),
-            start=start,
+            start=self._active_passive_or_none if start is None else start,
             names=self.states.names,
             failures=failures,
         )
@@ -294,7 +287,8 @@ class CalibrationProblem:
         Raises:
             ClosureError: If a posture cannot be reached with the active offsets.
         """
-        return self._close(self.active_theta, None)
+        theta = self._of_machine(self.active_theta)
+        return self.closure.close(self.states.commands, theta=theta, names=self.states.names)
 
     def nuisance_values(self, theta: ArrayLike) -> Array:
         """Nuisance parameters: manual alignment plus deviations, shape (..., n_nuisance), [SI].

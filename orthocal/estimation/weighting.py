@@ -62,7 +62,7 @@ def with_repeatability(
 ) -> tuple[GaugeReadings, ...]:
     """The gauges with the scatter of their repeated cycles."""
     o, values = problem.observations, problem.values * problem.noise_ratio
-    return tuple(replace(g, repeatability=_repeatability(values, o, g)) for g in groups)
+    return tuple(replace(g, repeatability=_repeatability(values, o, g.entries)) for g in groups)
 
 
 def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
@@ -121,11 +121,11 @@ def initial_sigmas(
             used[observations.minus[without]] = False
     result = np.empty(observations.size)
     for g in split_by_gauge(session, observations):
-        group = replace(g, entries=g.entries & used)
-        repeatability = _repeatability(values, observations, group)
-        if g.gauge.sigma is not None and repeatability[1]:
-            repeatability = _median_repeatability(values, observations, group), repeatability[1]
-        sigma = initial_sigma(g.gauge, repeatability)
+        entries = g.entries & used
+        scatter, dof = _repeatability(values, observations, entries)
+        if g.gauge.sigma is not None and dof:
+            scatter = _median_repeatability(values, observations, entries)
+        sigma = initial_sigma(g.gauge, (scatter, dof))
         result[g.entries] = sigma if without is None else max(sigma, assumed_sigma(g.gauge))
     return result
 
@@ -266,20 +266,20 @@ def _root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _repeatability(values: Array, o: Observations, group: GaugeReadings) -> tuple[float, int]:
-    """Scatter of the repeated cycles of a gauge, [m], and its degrees of freedom."""
-    return estimate_repeatability(values[group.entries], o.only(group.entries))
+def _repeatability(values: Array, o: Observations, entries: Mask) -> tuple[float, int]:
+    """Scatter of repeated cycles of masked entries, [m], and its degrees of freedom."""
+    return estimate_repeatability(values[entries], o.only(entries))
 
 
-def _median_repeatability(values: Array, o: Observations, group: GaugeReadings) -> float:
+def _median_repeatability(values: Array, o: Observations, of_gauge: Mask) -> float:
     """Median over the setups of a gauge of the scatter of repeated cycles, [m].
 
     Squares are divided by the median of χ²/ν (Wilson and Hilferty, 1931).
     """
     squares = []
-    for setup in np.unique(o.setup[group.entries]):
-        entries = group.entries & (o.setup == setup)
-        scatter, dof = estimate_repeatability(values[entries], o.only(entries))
+    for setup in np.unique(o.setup[of_gauge]):
+        entries = of_gauge & (o.setup == setup)
+        scatter, dof = _repeatability(values, o, entries)
         if dof:
             squares.append(scatter**2 / (1.0 - 2.0 / (9.0 * dof)) ** 3)
     return float(np.sqrt(np.median(squares)))

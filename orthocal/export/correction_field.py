@@ -129,7 +129,7 @@ class CorrectionField:
         """Largest estimated error of the polynomials in use, [m]."""
         n = len(self.axes)
         line = chebyshev_line(NODES_PER_AXIS)
-        self._nodes = grid_points(line, n)
+        self._nodes = grid_points(*[line] * n)
         self._fit = PolynomialFit(
             self._nodes, np.array(list(product(range(NODES_PER_AXIS), repeat=n)))
         )
@@ -140,7 +140,7 @@ class CorrectionField:
             / (NODES_PER_AXIS - 1)
         )
         random = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_CHECKS, n))
-        self._checks = np.vstack([grid_points(between, n), random])
+        self._checks = np.vstack([grid_points(*[between] * n), random])
 
     def __call__(self, points: Array) -> tuple[Array, Mapping[int, str]]:
         """Points to command.

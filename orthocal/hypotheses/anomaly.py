@@ -157,24 +157,12 @@ class Anomaly:
     alternatives: tuple[Explanation, ...] = ()
     """Nearly as likely explanations in other rows."""
 
-    @property
-    def ambiguous(self) -> bool:
-        """True if an explanation in other rows is nearly as likely."""
-        return bool(self.alternatives)
-
-    @property
-    def between_sessions(self) -> bool:
-        """True if the explanation or an alternative is a change between sessions."""
-        return any(e.sessions for e in (self.explanation, *self.alternatives))
-
 
 @dataclass(frozen=True, slots=True)
 class Anomalies:
     """Result of the search for anomalies in one session or several joined ones."""
 
     found: tuple[Anomaly, ...]
-    log_evidence: float
-    """Logarithm of the Bayes factor of the found anomalies against no anomaly."""
     explained: bool
     """Whether a machine near its tolerances explains the corrected readings. If not, there is a
     further cause."""
@@ -185,16 +173,9 @@ class Anomalies:
     machine explains the corrected readings."""
     tolerance_scale: float
     """Most likely factor between the machine's errors and their tolerances."""
-    noise_scale: float
-    """Most likely factor between the noise and its stated standard deviation."""
     suspected: tuple[int, ...] = ()
     """Rows of the most likely further mistakes, if anomalies were found and do not explain the
     readings."""
     log_posterior: float = 0.0
     """Logarithm of marginal likelihood times prior of the found anomalies, which compares different
     statements about the same readings."""
-
-    @property
-    def ambiguous(self) -> bool:
-        """True if any anomaly is ambiguous."""
-        return any(a.ambiguous for a in self.found)

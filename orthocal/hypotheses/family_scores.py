@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
-from orthocal.hypotheses.families.lost_steps import lost_steps
 from orthocal.hypotheses.families.printer_settings import changes_between_logs
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
-from orthocal.hypotheses.families.sessions import changes_between_sessions
+from orthocal.hypotheses.families.sessions import changes_between_sessions, lost_steps
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.families.wrong_readings import wrong_readings
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, to_dense
@@ -81,49 +80,35 @@ class FamilyScorer:
     ) -> Iterator[tuple[Family, Array]]:
         """Log Bayes factor of each hypothesis added to a state, to first order, with its prior."""
         likelihood = state.about.likelihood
-        deviation = state.remaining
-        base = likelihood.products(deviation[None])
+        base = likelihood.products(state.remaining[None])
         sound = float(likelihood.score(base)[0])
         for family in families:
             if not family.count:
                 continue
-            if family.groups:
-                logs = np.array(
-                    [
-                        likelihood.score_set(
-                            deviation, [self.model.entries(self._effects_of_group(g)[0])]
-                        ).log_likelihood
-                        for g in family.groups
-                    ]
-                )
-            elif family.systematic:
-                logs = np.array(
-                    [
-                        likelihood.score_set(
-                            deviation - self.model.entries(e.change[None])[0],
-                            [self.model.entries(e.columns)],
-                            priors=[prior_of(e)],
-                        ).log_likelihood
-                        for e in family.systematic
-                    ]
-                )
-            elif family.silent:
-                logs = np.array(
-                    [
-                        score_silent(self.model, likelihood, deviation, rows)[0].log_likelihood
-                        for rows in family.silent
-                    ]
-                )
-            elif family.shifts:
+            if family.shifts:
                 logs = self._score_shifts(state, family)
-            else:
+            elif family.edits is not None or family.effects is not None:
                 logs = np.concatenate(
                     [
                         self._score_rows(state, family, slice(k, k + CHUNK_SIZE), base)
                         for k in range(0, family.count, CHUNK_SIZE)
                     ]
                 )
+            else:
+                terms = (self.term(family, h) for h in range(family.count))
+                logs = np.array([self._score_alone(state, t) for t in terms])
             yield family, logs - sound + _prior(family)
+
+    def _score_alone(self, state: HypothesisSet, term: Term) -> float:
+        """Log likelihood of a state with a term of several effects or of silent rows."""
+        likelihood, deviation = state.about.likelihood, state.remaining
+        if term.silent is not None:
+            return score_silent(self.model, likelihood, deviation, term.silent)[0].log_likelihood
+        prior = None if term.systematic is None else prior_of(term.systematic)
+        if term.change is not None:
+            deviation = deviation + self.model.entries(term.change[None])[0]
+        effects = self.model.entries(np.asarray(term.effects))
+        return likelihood.score_set(deviation, [effects], priors=[prior]).log_likelihood
 
     def _score_rows(
         self, state: HypothesisSet, family: Family, chosen: slice, base: Products
@@ -165,7 +150,9 @@ class FamilyScorer:
         prior = float(_prior(family)[h])
         explanation = family.explain(h)
         if family.groups:
-            effects, unit = self._effects_of_group(family.groups[h])
+            group = family.groups[h]
+            marked = group if isinstance(group, np.ndarray) else marks(group, self._n_rows)
+            effects, unit = self._relative(marked)
             return Term(explanation, prior, effects=effects, unit=float(unit[0]))
         if family.systematic:
             effect = family.systematic[h]
@@ -183,11 +170,6 @@ class FamilyScorer:
             return Term(explanation, prior, edit)
         effects, unit = self._relative(family.effects.one(h)[None])
         return Term(explanation, prior, edit, effects, unit=float(unit[0]))
-
-    def _effects_of_group(self, group: Sequence[Indices] | Array) -> tuple[Array, Array]:
-        """Effects of a group as `_relative` returns them."""
-        marked = group if isinstance(group, np.ndarray) else marks(group, self._n_rows)
-        return self._relative(marked)
 
     def _relative(self, effects: Array) -> tuple[Array, Array]:
         """Effects on the rows (k, n_rows) per amount relative to the noise, and its unit (k,)."""

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from orthocal.arrays import Array, Indices, Mask
-from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.anomaly import Explanation, Scope
 from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.protocol import reads_pairs, states_readings
@@ -166,7 +166,7 @@ class SystematicEffect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Family:
-    """Hypotheses of one kind, which share a prior probability equally.
+    """Hypotheses of one kind, which share a prior probability equally; there may be none.
 
     Each hypothesis is one of these:
 
@@ -267,9 +267,9 @@ class Rows:
         return group_rows(r.place for r in self.session.readings)
 
     @cached_property
-    def groups(self) -> dict[tuple[str, str], tuple[str, ...]]:
+    def groups(self) -> dict[tuple[Scope, str], tuple[str, ...]]:
         """Setups of each leg and of each gauge with several but not all setups."""
-        members: dict[tuple[str, str], list[str]] = {}
+        members: dict[tuple[Scope, str], list[str]] = {}
         for name in self.setups:
             setup = self.session.setups[name]
             leg = getattr(setup.sensor, "leg", None)

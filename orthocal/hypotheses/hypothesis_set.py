@@ -44,6 +44,11 @@ class Term:
     unit: float = 1.0
     """Unit of the amount of a single effect: the noise of its gauge relative to the first one."""
 
+    @property
+    def unknown_shift(self) -> MachineShift | None:
+        """Machine shift of unknown amount; None without one."""
+        return None if self.known else self.shift
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HypothesisSet:
@@ -84,7 +89,7 @@ class HypothesisSet:
         return all(
             abs(a[0]) > LIMIT * std[0]
             for t, a, std in zip(self.terms, self.amounts, self.stds, strict=True)
-            if t.shift is not None and not t.known
+            if t.unknown_shift is not None
         )
 
 
@@ -97,11 +102,6 @@ def _count_drives(e: Explanation) -> int:
     return 2 if e.parameters and not e.rows else 0
 
 
-def negative_log_posterior(state: HypothesisSet) -> float:
-    """Negative logarithm of marginal likelihood times prior, as a sort key."""
-    return -state.log_posterior
-
-
 def split_amounts(terms: Sequence[Term], amounts: Array) -> tuple[Array, ...]:
     """Split amounts by term.
 
@@ -110,8 +110,7 @@ def split_amounts(terms: Sequence[Term], amounts: Array) -> tuple[Array, ...]:
         amounts: Amounts of all effects and unknown shifts, then of all silent rows, shape (k,).
     """
     sizes = [
-        len(t.effects) if t.effects is not None else int(t.shift is not None and not t.known)
-        for t in terms
+        len(t.effects) if t.effects is not None else int(t.unknown_shift is not None) for t in terms
     ]
     silent = [0 if t.silent is None else len(t.silent) for t in terms]
     effect_ends, silent_ends = np.cumsum([0, *sizes]), np.cumsum([sum(sizes), *silent])
@@ -139,7 +138,7 @@ def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
         single = term.effects is not None and len(term.effects) == 1 and e.kind != "row offset"
         if term.systematic is not None:
             e = _with_parameters(e, term.systematic, amounts, stds)
-        elif single or (term.shift is not None and not term.known):
+        elif single or term.unknown_shift is not None:
             e = replace(e, amount=float(amounts[0] * unit), std=float(stds[0] * unit))
         explanations.append(e)
     return explanations
@@ -169,9 +168,7 @@ def _with_parameters(
 
 def is_same_place(one: HypothesisSet, other: HypothesisSet) -> bool:
     """True if two sets concern the same rows, hypothesis by hypothesis."""
-    if len(one.terms) != len(other.terms):
-        return False
-    return not any(_unmatched(one.terms, other.terms))
+    return len(one.terms) == len(other.terms) and not any(_unmatched(one.terms, other.terms))
 
 
 def adds_a_setup(other: HypothesisSet, chosen: HypothesisSet) -> bool:
@@ -195,11 +192,9 @@ def share_rows(one: Term, other: Term) -> bool:
 def distinct_terms(terms: Sequence[Term]) -> list[Term]:
     """Hypotheses that share no row with a preceding one."""
     distinct: list[Term] = []
-    used: set[int] = set()
     for t in terms:
-        if not used & set(t.explanation.rows):
+        if not any(share_rows(t, preceding) for preceding in distinct):
             distinct.append(t)
-            used |= set(t.explanation.rows)
     return distinct
 
 
@@ -233,7 +228,7 @@ def find_alternatives(
     e = term.explanation
     causes: dict[tuple[object, ...], Explanation] = {}
     alternatives: dict[Explanation, None] = {}
-    for chosen, s in sorted(near, key=lambda pair: negative_log_posterior(pair[1])):
+    for chosen, s in sorted(near, key=lambda pair: -pair[1].log_posterior):
         if not any(t is term for t in chosen.terms):
             continue
         only_chosen, only_other = _unmatched(chosen.terms, s.terms)

@@ -96,14 +96,21 @@ class Likelihood:
 
     directions: Array
     """Orthonormal principal directions of the entries, shape (r, n_entries)."""
-    variances: Array
-    """Prior variance along each direction at tolerance scale 1, shape (r,), [m²]."""
+    errors: Array
+    """Errors of the machine per principal direction, shape (n_free, r), [prior std]."""
+    singular_values: Array
+    """Prior standard deviation along each direction at tolerance scale 1, shape (r,), [m]."""
     sigma: float
     """Stated standard deviation of a reading, [m]."""
     dof: int
     """Number of entries minus number of gauge zeros."""
     weights: Array
     """Logarithms of the prior weights of all pairs (e, s), shape (g,)."""
+
+    @property
+    def variances(self) -> Array:
+        """Prior variance along each direction at tolerance scale 1, shape (r,), [m²]."""
+        return np.asarray(self.singular_values**2)
 
     def grid(
         self, tolerance_scales: Array = SCALE_NODES, noise_scales: Array = NOISE_SCALES
@@ -244,9 +251,9 @@ class Likelihood:
                 silent entries and without zeros.
             n_silent: Number of silent entries.
         """
-        jacobian = restrict(np.sqrt(self.variances)[:, None] * self.directions).T
+        jacobian = restrict(self.singular_values[:, None] * self.directions).T
         dof = self.dof - n_silent
-        other, _, _ = build_likelihood(jacobian, sigma=self.sigma, dof=dof, stated=True)
+        other = build_likelihood(jacobian, sigma=self.sigma, dof=dof, stated=True)
         return replace(other, weights=self.weights)
 
     def predict(self, deviation: Array, restricted: Likelihood, score: Score) -> Array:
@@ -368,9 +375,7 @@ def log_of_sum(logs: Array, axis: int | None = None) -> Array:
     return np.asarray(total.squeeze(axis))
 
 
-def build_likelihood(
-    jacobian: Array, *, sigma: float, dof: int, stated: bool
-) -> tuple[Likelihood, Array, Array]:
+def build_likelihood(jacobian: Array, *, sigma: float, dof: int, stated: bool) -> Likelihood:
     """Likelihood of a linearised model.
 
     Args:
@@ -378,10 +383,6 @@ def build_likelihood(
         sigma: Standard deviation of a reading, [m].
         dof: Number of entries minus number of gauge zeros.
         stated: Whether `sigma` is stated in the session.
-
-    Returns:
-        The likelihood; errors of the machine per principal direction, shape (n_free, r), [prior
-        std]; and the singular values, shape (r,), [m].
     """
     basis, factor = None, jacobian
     if len(jacobian) > 2 * jacobian.shape[1]:  # a tall matrix: decompose its triangular factor
@@ -395,14 +396,14 @@ def build_likelihood(
     scale = log_normal(SCALE_NODES, TOLERANCE_SCALE_SPREAD)
     noise = noise_weights(stated=stated)
     weights = np.repeat(scale, NOISE_SCALES.size)
-    likelihood = Likelihood(
+    return Likelihood(
         np.ascontiguousarray(directions),
-        singular_values[significant] ** 2,
+        errors[significant].T,
+        singular_values[significant],
         sigma,
         dof,
         weights + np.tile(noise, SCALE_NODES.size),
     )
-    return likelihood, errors[significant].T, singular_values[significant]
 
 
 def noise_weights(*, stated: bool) -> Array:

@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array, Indices, Mask
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
@@ -25,6 +25,7 @@ from orthocal.hypotheses.hypothesis import (
     Patterns,
     Sparse,
     row_products,
+    sparse_rows,
 )
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
@@ -118,6 +119,7 @@ class LinearModel:
                 self.reference[self.problem.free.index(name)] = backlash
         self._shares = zero_shares(o)
         self._incidence = self.problem.zero_incidence
+        self._references: dict[bool, ModelLinearisation] = {}
 
     def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
         """Linearisation about the machine without errors; raises as `linearise` does.
@@ -125,15 +127,9 @@ class LinearModel:
         Some nuisance parameters change readings noticeably, but only to second order, such as the
         height of a fixed ball across the plane of motion. They are one standard deviation there.
         """
-        return self._reference_with_jacobian if keep_jacobian else self._reference
-
-    @cached_property
-    def _reference(self) -> ModelLinearisation:
-        return self._linearise_reference(keep_jacobian=False)
-
-    @cached_property
-    def _reference_with_jacobian(self) -> ModelLinearisation:
-        return self._linearise_reference(keep_jacobian=True)
+        if keep_jacobian not in self._references:
+            self._references[keep_jacobian] = self._linearise_reference(keep_jacobian=keep_jacobian)
+        return self._references[keep_jacobian]
 
     def _linearise_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
         """Linearisation about the machine without errors."""
@@ -202,10 +198,6 @@ class LinearModel:
         several = len(self.labels) > 1 or bool(self.compensated.any())
         return several or (small and bool(self.offsets))
 
-    def entries_of(self, sessions: Mask) -> Mask:
-        """Mask of the entries of sessions, shape (n_entries,), from their mask, (n_sessions,)."""
-        return np.asarray(sessions[self.session_of_entry])
-
     @property
     def order(self) -> Indices:
         """Sessions in the order of measuring, shape (n_sessions,).
@@ -237,16 +229,11 @@ class LinearModel:
     @cached_property
     def to_entries(self) -> Sparse:
         """Entries per unit of each row, in units of the first gauge, (n_rows, n_entries)."""
-        o = self.problem.observations
-        n = o.plus.size
-        if n > MAX_DENSE_COLUMNS and self._has_single_readings:
-            from scipy.sparse import csr_array
-
-            return csr_array(
-                (1.0 / self.problem.noise_ratio[o.plus], (np.arange(n), o.plus)), (n, o.size)
-            )
-        matrix = np.array([o.values(row) / self.problem.noise_ratio for row in np.eye(n)])
-        if n <= MAX_DENSE_COLUMNS:
+        o, ratio = self.problem.observations, self.problem.noise_ratio
+        if self._has_single_readings:
+            return sparse_rows(list(o.plus[:, None]), list(1.0 / ratio[o.plus, None]), o.size)
+        matrix = np.array([o.values(row) / ratio for row in np.eye(o.plus.size)])
+        if len(matrix) <= MAX_DENSE_COLUMNS:
             return matrix
         from scipy.sparse import csr_array
 
@@ -390,16 +377,12 @@ class LinearModel:
         expected, complete = readings[machine, entry], jacobians[machine, entry]
         require_finite(self.problem, expected, complete)
         jacobian, none = project_out_zeros(complete, o), np.empty((o.size, 0))
-        likelihood, error_directions, singular_values = build_likelihood(
-            jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
-        )
+        likelihood = build_likelihood(jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated)
         return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
             jacobian if keep_jacobian else none,
             complete if keep_jacobian else none,
             likelihood,
-            error_directions,
-            singular_values,
             theta,
             passive[-1],
         )
@@ -436,10 +419,8 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         model = self._without_noise_of(row)
-        if model is not self:
-            return model.predict_row(rows, row)
-        entries, effect = self.entries(np.array([rows, np.arange(rows.size) == row]))
-        about = self.approach(entries, effect)
+        entries, effect = model.entries(np.array([rows, np.arange(rows.size) == row]))
+        about = model.approach(entries, effect)
         (amount,), (std,) = about.likelihood.estimate_amounts(
             entries - about.expected, effect[None]
         )
@@ -461,17 +442,15 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         model = self._without_noise_of(row)
-        if model is not self:
-            return model.compare_row(rows, row)
-        mean, std = self.predict_row(rows, row)
+        mean, std = model.predict_row(rows, row)
         deviation = abs(rows[row] - mean)
         if not deviation > std:
             return mean, std
         with_mean = np.where(np.arange(rows.size) == row, mean, rows)
         misfits = []
         for values in (rows, with_mean):
-            (entries,) = self.entries(values[None])
-            about = self.approach(entries, np.zeros_like(entries))
+            (entries,) = model.entries(values[None])
+            about = model.approach(entries, np.zeros_like(entries))
             misfits.append(about.likelihood.misfit(entries - about.expected))
         increase = max(misfits[0] - misfits[1], 0.0)
         return mean, max(std, deviation / max(math.sqrt(increase), 1.0))
@@ -526,13 +505,9 @@ class LinearModel:
             return about.likelihood.misfit(deviation - amount * effect)
 
         best = self._descend(self.at_reference(keep_jacobian=False), entries, effect)
-        minima = [best]
-        for theta in self._mirrored(best):
-            try:
-                start = self.linearise(theta, (), best.passive, keep_jacobian=False)
-            except (ClosureError, SessionError, np.linalg.LinAlgError):
-                continue
-            minima.append(self._descend(start, entries, effect))
+        mirrored = [LinearisationPoint(t, (), best.passive) for t in self._mirrored(best)]
+        starts = self.linearise_all(mirrored, keep_jacobian=False)
+        minima = [best, *(self._descend(s, entries, effect) for s in starts if s is not None)]
         return min(minima, key=misfit)
 
     def _mirrored(self, about: ModelLinearisation) -> Array:
@@ -574,12 +549,10 @@ class LinearModel:
         """
         step = errors - about.theta
         for share in 0.5 ** np.arange(MAX_HALVINGS + 1):
-            try:
-                return self.linearise(
-                    about.theta + share * step, (), about.passive, keep_jacobian=False
-                )
-            except (ClosureError, SessionError, np.linalg.LinAlgError):
-                continue
+            point = LinearisationPoint(about.theta + share * step, (), about.passive)
+            (nearer,) = self.linearise_all([point], keep_jacobian=False)
+            if nearer is not None:
+                return nearer
         return None
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
@@ -657,9 +630,9 @@ class LinearModel:
             deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             about: The linearisation.
         """
-        errors = about.errors_for(deviation)
-        along = about.singular_values * (about.error_directions.T @ errors)
-        residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
+        errors, likelihood = about.errors_for(deviation), about.likelihood
+        along = likelihood.singular_values * (likelihood.errors.T @ errors)
+        residuals = (deviation - along @ likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 

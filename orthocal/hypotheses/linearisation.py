@@ -31,10 +31,6 @@ class ModelLinearisation:
     complete_jacobian: Array
     """The Jacobian before the gauge zeros are projected out, of the same shape, [m]."""
     likelihood: Likelihood
-    error_directions: Array
-    """Errors per principal direction, shape (n_free, r), [prior std]."""
-    singular_values: Array
-    """Singular values, shape (r,), [m]."""
     theta: Array
     """Errors at the point of linearisation minus those of the reference, (n_free,), [prior std]."""
     passive: Array
@@ -50,10 +46,11 @@ class ModelLinearisation:
             tolerance_scale: Tolerance scale e.
             noise_scale: Noise scale s.
         """
-        e2 = tolerance_scale**2
-        variance = e2 * self.singular_values**2 + (noise_scale * self.likelihood.sigma) ** 2
-        along = self.likelihood.directions @ deviation
-        return np.asarray(self.error_directions @ (e2 * self.singular_values / variance * along))
+        e2, likelihood = tolerance_scale**2, self.likelihood
+        sizes = likelihood.singular_values
+        variance = e2 * sizes**2 + (noise_scale * likelihood.sigma) ** 2
+        along = likelihood.directions @ deviation
+        return np.asarray(likelihood.errors @ (e2 * sizes / variance * along))
 
     def log_positive_share(
         self,
@@ -79,9 +76,9 @@ class ModelLinearisation:
         scales = {"tolerance_scale": tolerance_scale, "noise_scale": noise_scale}
         prior_mean = reference[positive]
         mean = prior_mean + self.errors_for(deviation, **scales)[positive]
-        resolved = tolerance_scale**2 * self.singular_values**2
+        resolved = tolerance_scale**2 * self.likelihood.variances
         resolved /= resolved + (noise_scale * self.likelihood.sigma) ** 2
-        rows = self.error_directions[positive]
+        rows = self.likelihood.errors[positive]
         prior = tolerance_scale**2 * np.eye(len(rows))
         covariance = prior - tolerance_scale**2 * (rows * resolved @ rows.T)
         prior_share = log_positive_share_of_independent(prior_mean, tolerance_scale)

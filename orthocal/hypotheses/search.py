@@ -40,7 +40,6 @@ from orthocal.hypotheses.hypothesis_set import (
     find_alternatives,
     is_local,
     is_same_place,
-    negative_log_posterior,
     share_rows,
 )
 from orthocal.hypotheses.likelihood import log_of_sum
@@ -73,6 +72,10 @@ LARGEST_NOISE_SCALE = 2.5
 """Upper limit of the noise scale of a plausible gauge with a stated noise."""
 
 
+Near = list[tuple[HypothesisSet, HypothesisSet]]
+"""Pairs of the set after a step and a nearly as likely one."""
+
+
 def find_anomalies(session: Session) -> Anomalies:
     """Find the anomalies of a session.
 
@@ -85,7 +88,7 @@ def find_anomalies(session: Session) -> Anomalies:
     """
     linear = linear_model(session)
     if len(session.readings) < 2 or linear.dof < 1:
-        return Anomalies((), 0.0, True, 0.0, 0.0, 1.0, 1.0)
+        return Anomalies((), True, 0.0, 0.0, 1.0)
     return _Search(session, linear).run()
 
 
@@ -134,7 +137,7 @@ class _Search:
                     state, near = self._search()
         return self._result(*self._confirm(state), near)
 
-    def _search(self) -> tuple[HypothesisSet, list[tuple[HypothesisSet, HypothesisSet]]]:
+    def _search(self) -> tuple[HypothesisSet, Near]:
         """Select hypotheses about the present sound set; returns as `_select` does.
 
         A wrong unit or decimal point of many readings also explains a small part of several gross
@@ -155,19 +158,17 @@ class _Search:
         before, after = (self.model.rms(s.remaining, s.about) for s in (self.sound, state))
         return after > before and not self.is_plausible(state)
 
-    def _select(
-        self, *, grouped: bool
-    ) -> tuple[HypothesisSet, list[tuple[HypothesisSet, HypothesisSet]]]:
+    def _select(self, *, grouped: bool) -> tuple[HypothesisSet, Near]:
         """Select a set of hypotheses step by step.
 
         Args:
             grouped: Whether units and signs of groups of readings are considered.
 
         Returns:
-            The set; and pairs of the set after a step and a nearly as likely one.
+            The set; and nearly as likely ones.
         """
         state = self.sound
-        near: list[tuple[HypothesisSet, HypothesisSet]] = []
+        near: Near = []
         while len(state.terms) < MAX_ANOMALIES:
             extended, alternatives = self._step(state, grouped=grouped)
             if extended is None:
@@ -216,10 +217,10 @@ class _Search:
         extended = far + self.sets.evaluate_all(
             [(*state.terms, *added) for added in additions], state.about
         )
-        likeliest = min(extended, key=negative_log_posterior)
+        likeliest = max(extended, key=lambda s: s.log_posterior)
         if not self.is_plausible(likeliest) and len(state.terms) + 2 <= MAX_ANOMALIES:
             extended += self._combine(state, single)
-        ranked = sorted(extended, key=negative_log_posterior)
+        ranked = sorted(extended, key=lambda s: s.log_posterior, reverse=True)
         # correcting one of several anomalies leads to implausible readings
         plausible = [s for s in ranked if self.is_plausible(s)]
         if plausible and plausible[0].log_posterior > ranked[0].log_posterior - CLEAR_LOG_BAYES:
@@ -269,7 +270,7 @@ class _Search:
         sets = self.sets.evaluate_all([(*state.terms, *pair) for pair in pairs], state.about)
         if not sets:
             return []
-        one, other = min(sets, key=negative_log_posterior).terms[-2:]
+        one, other = max(sets, key=lambda s: s.log_posterior).terms[-2:]
         variants = [
             (t, partner)
             for replaced, partner in ((one, other), (other, one))
@@ -311,7 +312,8 @@ class _Search:
             near = self.sets.evaluate_all(_reduced(state), self.sound.about)
             reoptimised = [self.sets.most_likely(s.terms) or s for s in near]
             without = [
-                min(p, key=negative_log_posterior) for p in zip(near, reoptimised, strict=True)
+                max(pair, key=lambda s: s.log_posterior)
+                for pair in zip(near, reoptimised, strict=True)
             ]
             superfluous = [
                 s
@@ -320,7 +322,7 @@ class _Search:
             ]
             if not superfluous:
                 return state, without
-            state = min(superfluous, key=negative_log_posterior)
+            state = max(superfluous, key=lambda s: s.log_posterior)
         return state, [self.sound for _ in state.terms]
 
     def _expected(self, state: HypothesisSet, row: int) -> float:
@@ -337,18 +339,13 @@ class _Search:
         rows = {i for e in likely for i in (e.rows[:1] if e.kind == "row offset" else e.rows)}
         return tuple(sorted(rows))
 
-    def _result(
-        self,
-        state: HypothesisSet,
-        without: list[HypothesisSet],
-        near: list[tuple[HypothesisSet, HypothesisSet]],
-    ) -> Anomalies:
+    def _result(self, state: HypothesisSet, without: list[HypothesisSet], near: Near) -> Anomalies:
         """Anomalies of a state, with nearly as likely causes and alternatives.
 
         Args:
             state: The state.
             without: Sets without each of its hypotheses.
-            near: Pairs of a chosen set of hypotheses and a nearly as likely set.
+            near: Nearly as likely sets.
         """
         sound = self.sound
         anomalies = []
@@ -371,12 +368,10 @@ class _Search:
         explained = any(t.silent is not None for t in state.terms) or self.is_plausible(state)
         return Anomalies(
             tuple(anomalies),
-            state.log_posterior - sound.log_posterior,
             explained,
             self.model.rms(sound.remaining, sound.about),
             self.model.rms(state.remaining, state.about),
             state.score.tolerance_scale,
-            state.score.noise_scale,
             () if explained or not state.terms else self.suspected_rows(state),
             state.log_posterior,
         )

@@ -110,7 +110,7 @@ class SetEvaluator:
         shifted = iter(self._linearise_shifted([s for s in shifts if s]))
         states = []
         for terms, known in zip(term_sets, shifts, strict=True):
-            unknown = sum(map(_is_unknown_shift, terms))
+            unknown = sum(t.unknown_shift is not None for t in terms)
             about = next(shifted) if known else self.sound.about if unknown else start
             state = self._evaluate_about(terms, about or start, np.zeros(unknown))
             states.append(state if about else _without_likelihood(state))
@@ -124,7 +124,7 @@ class SetEvaluator:
         It is about the errors without anomalies, or the reference where their readings are not
         possible, as for a tip that misses its rod. None where neither is possible.
         """
-        if not shifts:
+        if not shifts:  # such as for the set without anomalies itself
             return []
         results: list[ModelLinearisation | None] = [None] * len(shifts)
         for about in (self.sound.about, self.reference):
@@ -147,7 +147,7 @@ class SetEvaluator:
             return None
         if not _are_small(errors) and (not first or np.abs(errors).max() > LARGEST_FIRST_STEP):
             return None
-        unknown = [t.shift for t in state.terms if t.shift is not None and not t.known]
+        unknown = [t.unknown_shift for t in state.terms if t.unknown_shift is not None]
         shifts = [
             replace(s, direction=s.direction * a)
             for s, a in zip(unknown, _applied(state), strict=True)
@@ -172,7 +172,7 @@ class SetEvaluator:
         priors = [
             None if t.systematic is None else prior_of(t.systematic)
             for t in terms
-            if t.effects is not None or (t.shift is not None and not t.known)
+            if t.effects is not None or t.unknown_shift is not None
         ]
         deviation = self.model.entries(rows[None])[0] - about.expected + applied @ steps
         if silent:
@@ -185,9 +185,9 @@ class SetEvaluator:
             remaining = deviation - (score.amounts @ np.concatenate(groups) if groups else 0.0)
         amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
         changes = [
-            abs(a[0]) * np.abs(t.shift.direction).max()
+            abs(a[0]) * np.abs(t.unknown_shift.direction).max()
             for t, a in zip(terms, amounts, strict=True)
-            if t.shift is not None and not t.known
+            if t.unknown_shift is not None
         ]
         state = HypothesisSet(
             tuple(terms), score, about, remaining, correct_rows(rows, terms, amounts), amounts, stds
@@ -208,8 +208,8 @@ class SetEvaluator:
         for t in terms:
             if t.effects is not None:
                 groups.append(model.entries(t.effects))
-            elif t.shift is not None and not t.known:
-                groups.append(model.shift_entries(about, t.shift)[None])
+            elif t.unknown_shift is not None:
+                groups.append(model.shift_entries(about, t.unknown_shift)[None])
                 steps.append(groups[-1][0])
         return groups, np.array(steps).reshape(len(steps), -1 if steps else about.expected.size)
 
@@ -273,11 +273,6 @@ def _without_likelihood(state: HypothesisSet) -> HypothesisSet:
     return replace(state, score=replace(state.score, log_likelihood=-np.inf))
 
 
-def _is_unknown_shift(term: Term) -> bool:
-    """True if a hypothesis is a machine shift of unknown amount."""
-    return term.shift is not None and not term.known
-
-
 def _known_shifts(terms: Sequence[Term]) -> list[MachineShift]:
     """Machine shifts of known amounts."""
     return [t.shift for t in terms if t.shift is not None and t.known]
@@ -286,7 +281,7 @@ def _known_shifts(terms: Sequence[Term]) -> list[MachineShift]:
 def _applied(state: HypothesisSet) -> Array:
     """Estimated amounts of the unknown machine shifts, shape (n,)."""
     pairs = zip(state.terms, state.amounts, strict=True)
-    return np.array([a[0] for t, a in pairs if _is_unknown_shift(t)])
+    return np.array([a[0] for t, a in pairs if t.unknown_shift is not None])
 
 
 def _are_small(errors: Array) -> bool:

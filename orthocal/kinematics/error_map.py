@@ -39,7 +39,7 @@ from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.se3 import exp6, right_jacobian
-from orthocal.kinematics.symbolic import Pose, moved_frames, nominal_placement
+from orthocal.kinematics.symbolic import ROUNDING_ERROR, Pose, moved_frames, nominal_placement
 from orthocal.robot.frames import Placement
 from orthocal.robot.model import Robot
 
@@ -135,16 +135,16 @@ class ErrorMap:
         errors = ca.SX.sym("errors", len(self.names))
         commanded = ca.SX.sym("commanded", len(robot.drives))
         symbols = {c: ca.SX.sym(c, condition_size(robot, c)) for c in NEUTRAL}
-        machine = express_machine(
+        actuated, machine_twists = express_machine(
             robot, commanded, {n: errors[i] for i, n in enumerate(self.names)}, symbols
         )
-        sparse = {p: ca.sparsify(t) for p, t in machine.twists.items()}
+        sparse = {p: ca.sparsify(t) for p, t in machine_twists.items()}
         twist_of = {p: t for p, t in sparse.items() if t.nnz()}
         moved, reference = list(twist_of), _reference_twists(robot, twist_of, symbols)
         self.moved = (*moved, *reference)
         self.in_reference = {moved.index(p): len(moved) + i for i, p in enumerate(reference)}
         twists = ca.vertcat(ca.SX(0, 1), *twist_of.values(), *reference.values())
-        self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), symbols)
+        self.conditions = _conditions_in(ca.vertcat(twists, actuated), symbols)
         self.placement_conditions = _conditions_in(twists, symbols)
         neutral = neutral_values(robot)
         sizes = [condition_size(robot, c) for c in self.conditions]
@@ -158,13 +158,13 @@ class ErrorMap:
             if name in self.conditions:
                 self._neutral[of_condition == name] = robot.drive_zero
         conditions = ca.vertcat(ca.SX(0, 1), *(symbols[c] for c in self.conditions))
-        by_errors = ca.jacobian(machine.actuated, errors)
+        by_errors = ca.jacobian(actuated, errors)
         self.drive_errors = np.unique(np.array(by_errors.sparsity().get_triplet()[1], np.int64))
         chosen = self.drive_errors.tolist()
         inputs = [ca.vertcat(commanded, conditions), errors[chosen]]
-        self.drives = ca.Function("drives", inputs, [machine.actuated])
+        self.drives = ca.Function("drives", inputs, [actuated])
         self._drives = BatchFunction(self.drives)
-        by_commands = ca.jacobian(machine.actuated, commanded)
+        by_commands = ca.jacobian(actuated, commanded)
         labels = ["by_commands", "by_errors"]
         self._drive_derivatives = BatchFunction(
             ca.Function(
@@ -217,12 +217,6 @@ class ErrorMap:
         result = np.array(commands)
         result[..., self._coordinates] = commands[..., : self._coordinates.size]
         return result
-
-    def split(self, conditions: ca.SX) -> dict[Condition, ca.SX]:
-        """Split the conditions of a command, shape (n_conditions,), by name."""
-        sizes = [condition_size(self.robot, c) for c in self.conditions]
-        parts = ca.vertsplit(conditions, np.cumsum([0, *sizes]).tolist()) if sizes else []
-        return dict(zip(self.conditions, parts, strict=True))
 
     def geometry(self, errors: ArrayLike, commands: Array | None = None) -> MachineGeometry:
         """Placements and drives of machines with errors.
@@ -529,7 +523,7 @@ class _Twists:
         return twists.reshape(*shape, -1), by_errors.reshape(*shape, *by_errors.shape[1:])
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def error_map(robot: Robot) -> ErrorMap:
     """Error map of a robot, built once."""
     return ErrorMap(robot)
@@ -601,9 +595,8 @@ class SymbolicErrorMap:
 
         self.placements = ordered([symbols[1], symbols[3]], 12)
         self._placement_jacobian = ordered(jacobians, 6)
-        chosen = map_.drive_errors
-        self._drives = map_.drives
-        self._drive_errors = ca.SX(fixed[chosen]) + ca.sparsify(ca.SX(unit_errors[chosen])) @ theta
+        self._map = map_
+        self._errors = ca.SX(fixed) + ca.sparsify(ca.SX(unit_errors)) @ theta
 
     def values(self, theta: ca.MX, conditions: Array) -> list[ca.MX]:
         """Values of the symbols: one column, or one for each of V > 1 conditions if they vary.
@@ -623,7 +616,17 @@ class SymbolicErrorMap:
 
     def actuated(self, command: ca.SX) -> ca.SX:
         """Actual drive coordinates of a command, shape (n_drives,), [m, rad]."""
-        return self._drives(command, self._drive_errors)
+        return self._map.drives(command, self._errors[self._map.drive_errors.tolist()])
+
+    def direct_placements(self, command: ca.SX) -> ca.SX:
+        """Moved placements of a command as expressions of θ̂, shape (12 n_moved,)."""
+        twists, _ = self._map.twists(command[len(self._map.robot.drives) :], self._errors)
+        nominal = np.where(np.abs(self._map.nominal) < ROUNDING_ERROR, 0.0, self._map.nominal)
+        placements = [
+            _moved_placement()(twists[6 * k : 6 * k + 6], ca.SX(row))[0]
+            for k, row in enumerate(nominal)
+        ]
+        return ca.vertcat(ca.SX(0, 1), *placements)
 
     def chain(self, by_twists: ca.SX, by_actuated: ca.SX, command: ca.SX) -> ca.SX:
         """Derivative of rows with respect to θ̂, by the chain rule.

@@ -27,6 +27,9 @@ Result = TypeVar("Result")
 MAX_FUNCTIONS = 256
 """Functions held in memory; one needs up to 2 MB."""
 
+MAX_ROBOTS = 8
+"""Robots whose results of a function are held in memory."""
+
 _CODE_DIRECTORIES = (
     "kinematics",
     "sensors",
@@ -104,25 +107,15 @@ class _RobotKey:
     robot: Robot = field(compare=False)
 
 
-def cached_per_robot(
-    maxsize: int,
-) -> Callable[[Callable[[Robot], Result]], Callable[[Robot], Result]]:
-    """Decorator that caches a function of a robot; robots of equal identity share the result.
+def cached_per_robot(function: Callable[[Robot], Result]) -> Callable[[Robot], Result]:
+    """Decorator that caches a function of a robot; robots of equal identity share the result."""
+    cached = lru_cache(MAX_ROBOTS)(lambda key: function(key.robot))
 
-    Args:
-        maxsize: Number of robots whose results are cached.
-    """
+    @wraps(function)
+    def look_up(robot: Robot) -> Result:
+        return cached(_RobotKey(identify(robot), robot))
 
-    def decorate(function: Callable[[Robot], Result]) -> Callable[[Robot], Result]:
-        cached = lru_cache(maxsize)(lambda key: function(key.robot))
-
-        @wraps(function)
-        def look_up(robot: Robot) -> Result:
-            return cached(_RobotKey(identify(robot), robot))
-
-        return look_up
-
-    return decorate
+    return look_up
 
 
 def identify(robot: Robot) -> tuple[str, str]:

@@ -457,51 +457,48 @@ class LoopClosure:
         )
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def _solutions(robot: Robot) -> ArrayCache:
     """Solutions of a robot from the reference posture, which all models of a session need."""
     return ArrayCache(SOLUTION_CACHE_SIZE)
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def nominal_closure(robot: Robot) -> LoopClosure:
     """Loop closure solver of a robot without errors, built once."""
     return LoopClosure(robot)
 
 
-class _UnitRodForces:
-    """Axial forces of the rods per unit force on the tool, cached for sets of postures.
+@cached_per_robot
+def _rod_forces(robot: Robot) -> tuple[RodForces, ArrayCache]:
+    """Rod forces of a robot, and a cache of them for sets of postures.
 
     The same postures recur under several payloads and with several machines.
+    """
+    return RodForces(robot), ArrayCache(FORCE_CACHE_SIZE)
+
+
+def _unit_rod_forces(robot: Robot, drives: Array) -> Array:
+    """Axial forces ∂p/∂ℓ of all rods per unit force on the tool; 0 in postures out of reach.
 
     Args:
         robot: The nominal robot.
+        drives: Shape (K, n_drives), [m, rad].
+
+    Returns:
+        Shape (K, n_rods, 3).
     """
+    forces, cache = _rod_forces(robot)
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot, self._forces = robot, RodForces(robot)
-        self._cache = ArrayCache(FORCE_CACHE_SIZE)
-
-    def __call__(self, drives: Array) -> Array:
-        """∂p/∂ℓ of all rods, shape (K, n_rods, 3); 0 in postures out of reach."""
-        return self._cache.find(drives.tobytes(), lambda: self._compute(drives))
-
-    def _compute(self, drives: Array) -> Array:
-        """Forces at drive coordinates, shape (K, n_drives)."""
-        robot = self._robot
+    def compute() -> Array:
         result = np.zeros((len(drives), len(robot.rods), 3))
         passive = nominal_closure(robot).close(drives, failures={}) if drives.size else drives
         reached = np.isfinite(passive).all(axis=1)
         if reached.any():
-            coordinates = robot.joint_coordinates(drives[reached], passive[reached])
-            result[reached] = self._forces(coordinates)
+            result[reached] = forces(robot.joint_coordinates(drives[reached], passive[reached]))
         return result
 
-
-@cached_per_robot(maxsize=8)
-def _unit_rod_forces(robot: Robot) -> _UnitRodForces:
-    """Unit rod forces of a robot, prepared once."""
-    return _UnitRodForces(robot)
+    return cache.find(drives.tobytes(), compute)
 
 
 def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
@@ -520,7 +517,7 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
     effects = robot_effects(robot)
     forces = np.array([[e.tool_force(float(m)) for e in effects] for m in masses])
     on_tool = forces.reshape(-1, len(effects), 3).sum(axis=1)[mass_of]
-    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), on_tool))
+    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot, drives), on_tool))
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> Failures:

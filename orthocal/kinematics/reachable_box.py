@@ -79,7 +79,7 @@ def find_workspace(robot: Robot, require_reach: RequireReach | None = None) -> W
     return box_workspace(robot, requested)
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def _default_workspace(robot: Robot) -> Workspace:
     """Largest cube of at most ±60 mm that the nominal machine reaches with a margin."""
     zero, require_reach = tool_at_zero(robot), _nominal_reach_check(robot)

@@ -387,7 +387,7 @@ class RobotFunctions:
         return cached_function(function_key(name, self.digest, digest), build)
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def robot_functions(robot: Robot) -> RobotFunctions:
     """Functions of a robot, built once."""
     return RobotFunctions(robot)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias, overload
 
 import casadi as ca
@@ -44,14 +45,11 @@ _BERNOULLI = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 
 
 class _Operations(NamedTuple):
-    """Operations with different names in NumPy and CasADi; vectors are columns."""
+    """Library of a type, and its operations with other names; vectors are columns."""
 
+    library: ModuleType
     where: Callable[[Any, Any, Any], Any]
-    sqrt: Callable[[Any], Any]
-    sin: Callable[[Any], Any]
-    cos: Callable[[Any], Any]
     skew: Callable[[Any], Any]
-    transpose: Callable[[Any], Any]
 
 
 @overload
@@ -69,10 +67,10 @@ def exp6(twist: Operand) -> tuple[Operand, Operand]:
     Returns:
         Rotation, shape (..., 3, 3), and position, shape (..., 3), [m].
     """
-    m, v, w = _split(twist)
+    m, v, w, square = _split(twist)
     if m is _CASADI and w.is_zero():
         return ca.SX.eye(3), v
-    a, b, c = _coefficients(m, m.transpose(w) @ w, 3)
+    a, b, c = _coefficients(m, square, 3)
     hat = m.skew(w)
     cross = hat @ v
     rotation = np.eye(3) + a * hat + b * (hat @ hat)
@@ -125,8 +123,8 @@ def right_jacobian(twist: Operand) -> Operand:
     Returns:
         Shape (..., 6, 6).
     """
-    m, v, w = _split(twist)
-    _, a2, a3, a4, a5 = _coefficients(m, m.transpose(w) @ w, 5)
+    m, v, w, square = _split(twist)
+    _, a2, a3, a4, a5 = _coefficients(m, square, 5)
     hat_v, hat_w = m.skew(v), m.skew(w)
     wv, vw, ww = hat_w @ hat_v, hat_v @ hat_w, hat_w @ hat_w
     wvw = wv @ hat_w
@@ -169,8 +167,8 @@ def _coefficients(m: _Operations, square: Operand, count: int) -> list[Operand]:
     """Coefficients α_1 to α_count of a squared angle, [rad²]."""
     near = square < SERIES_BELOW
     safe = m.where(near, 1.0, square)
-    angle = m.sqrt(safe)
-    sine, cosine = m.sin(angle), m.cos(angle)
+    angle = m.library.sqrt(safe)
+    sine, cosine = m.library.sin(angle), m.library.cos(angle)
     far = (
         sine / angle,
         (1.0 - cosine) / safe,
@@ -194,27 +192,14 @@ def _polynomial(x: Operand, coefficients: tuple[float, ...]) -> Operand:
     return total
 
 
-def _split(twist: Operand) -> tuple[_Operations, Operand, Operand]:
-    """Operations for the type of a twist, and its translation and rotation as columns."""
+def _split(twist: Operand) -> tuple[_Operations, Operand, Operand, Operand]:
+    """Operations for the type of a twist, its translation v and rotation ω as columns, and ωᵀω."""
     if isinstance(twist, ca.SX):
-        return _CASADI, twist[:3], twist[3:]
+        return _CASADI, twist[:3], twist[3:], twist[3:].T @ twist[3:]
     columns = np.asarray(twist, dtype=np.float64)[..., None]
-    return _NUMPY, columns[..., :3, :], columns[..., 3:, :]
+    w = columns[..., 3:, :]
+    return _NUMPY, columns[..., :3, :], w, np.swapaxes(w, -1, -2) @ w
 
 
-_NUMPY = _Operations(
-    where=np.where,
-    sqrt=np.sqrt,
-    sin=np.sin,
-    cos=np.cos,
-    skew=lambda column: skew(column[..., 0]),
-    transpose=lambda a: np.swapaxes(a, -1, -2),
-)
-_CASADI = _Operations(
-    where=ca.if_else,
-    sqrt=ca.sqrt,
-    sin=ca.sin,
-    cos=ca.cos,
-    skew=ca.skew,
-    transpose=lambda a: a.T,
-)
+_NUMPY = _Operations(np, np.where, lambda column: skew(column[..., 0]))
+_CASADI = _Operations(ca, ca.if_else, ca.skew)

@@ -16,11 +16,12 @@ import numpy as np
 import pinocchio as pin
 
 from orthocal.arrays import Array
-from orthocal.effects.machine import express_machine
-from orthocal.effects.protocol import Condition, Placement
-from orthocal.kinematics.se3 import exp6, log6
-from orthocal.robot.frames import nearest_carrier
+from orthocal.kinematics.se3 import log6
+from orthocal.robot.frames import Placement, nearest_carrier
 from orthocal.robot.model import Robot, joint_axis
+
+ROUNDING_ERROR = 1e-15
+"""Largest component of a nominal placement that is a rounding error, [1, m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +46,8 @@ def constant_pose(placement: pin.SE3) -> Pose:
     """Symbolic pose of a Pinocchio placement, with rounding errors replaced by structural zeros."""
     rotation = np.array(placement.rotation)
     position = np.array(placement.translation)
-    rotation[np.abs(rotation) < 1e-15] = 0.0
-    position[np.abs(position) < 1e-15] = 0.0
+    rotation[np.abs(rotation) < ROUNDING_ERROR] = 0.0
+    position[np.abs(position) < ROUNDING_ERROR] = 0.0
     return Pose(ca.sparsify(ca.SX(rotation)), ca.sparsify(ca.SX(position)))
 
 
@@ -154,47 +155,6 @@ def moved_frames(moved: Iterable[Placement]) -> frozenset[int]:
     return frozenset(p.index for p in moved if p.of_frame)
 
 
-class SymbolicRobot:
-    """Closed-loop model of a robot as expressions of drives, passive joints and errors.
-
-    Args:
-        robot: The nominal robot.
-        drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
-        passive: Passive coordinates, shape (n_passive,), [m, rad].
-        errors: Names of parameters, mapped to expressions or numbers, [unit of the parameter].
-        conditions: Conditions of the posture; neutral where absent.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        drives: ca.SX,
-        passive: ca.SX,
-        errors: Mapping[str, ca.SX | float] | None = None,
-        conditions: Mapping[Condition, ca.SX] | None = None,
-    ) -> None:
-        self.robot = robot
-        machine = express_machine(robot, drives, errors or {}, conditions)
-        self.actuated = machine.actuated
-        """Actual drive coordinates, shape (n_drives,), [m, rad]."""
-        coordinates = ca.SX(robot.model.nv, 1)
-        coordinates[robot.drive_index.tolist()] = self.actuated
-        coordinates[robot.passive_index.tolist()] = passive
-        joints, frames = erroneous_placements(robot.model, machine.twists)
-        self.tree = SymbolicTree(
-            robot.model, coordinates, joint_placements=joints, frame_placements=frames
-        )
-
-    def frame_pose(self, name: str) -> Pose:
-        """World pose of a named frame."""
-        return self.tree.frame_pose(self.robot.frame_id(name))
-
-    def closure_residual(self) -> ca.SX:
-        """Residual g(q, θ) of all closures, shape (closure_rows,), [m, rad]."""
-        return closure_residual(self.robot, self.tree)
-
-
 def closure_residual(robot: Robot, tree: SymbolicTree) -> ca.SX:
     """Constrained components of all closures: position of frame b in a, or log6 of its pose in a.
 
@@ -213,18 +173,3 @@ def closure_residual(robot: Robot, tree: SymbolicTree) -> ca.SX:
         error = relative.position if point else log6(relative.rotation, relative.position)
         errors.append(error[list(c.rows)])
     return ca.vertcat(ca.SX(0, 1), *errors)
-
-
-def erroneous_placements(
-    model: pin.Model, twists: Mapping[Placement, ca.SX]
-) -> tuple[dict[int, Pose], dict[int, Pose]]:
-    """Placements · exp6(δ) of the joints and of the frames with errors, by index."""
-    joints: dict[int, Pose] = {}
-    frames: dict[int, Pose] = {}
-    nonzero = {p: twist for p, twist in twists.items() if ca.sparsify(twist).nnz()}
-    moved = moved_frames(nonzero)
-    for placement, twist in nonzero.items():
-        nominal = constant_pose(nominal_placement(model, placement, moved))
-        poses = frames if placement.of_frame else joints
-        poses[placement.index] = nominal * Pose(*exp6(twist))
-    return joints, frames

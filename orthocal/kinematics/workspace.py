@@ -208,10 +208,10 @@ def box_workspace(
     limits, nodes = read_only(box), _lobatto_points(points_per_side)
     legendre = np.polynomial.legendre.Legendre.basis(points_per_side - 1)
     node_weights = 1.0 / (points_per_side * (points_per_side - 1) * legendre(nodes) ** 2)
-    points = grid_points(nodes, len(limits))
-    weights = grid_points(node_weights, len(limits)).prod(axis=1)
+    points = grid_points(*[nodes] * len(limits))
+    weights = grid_points(*[node_weights] * len(limits)).prod(axis=1)
     return Workspace(
-        read_only(_scale_to(limits, points, tool_at_zero(robot))),
+        read_only(_scale_to(limits, points, robot)),
         read_only(weights),
         limits,
         read_only(nodes),
@@ -252,8 +252,8 @@ def uniform_grid(robot: Robot, box: ArrayLike, *, points_per_side: int) -> Array
         Shape (n^n_coordinates, n_coordinates); the last coordinate varies fastest.
     """
     limits = np.asarray(box, dtype=np.float64)
-    points = grid_points(np.linspace(-1.0, 1.0, points_per_side), len(limits))
-    return _scale_to(limits, points, tool_at_zero(robot))
+    points = grid_points(*[np.linspace(-1.0, 1.0, points_per_side)] * len(limits))
+    return _scale_to(limits, points, robot)
 
 
 def gauss_box(robot: Robot, box: ArrayLike) -> Workspace:
@@ -268,11 +268,11 @@ def gauss_box(robot: Robot, box: ArrayLike) -> Workspace:
     limits = read_only(box)
     count = len(limits)
     nodes, node_weights = np.polynomial.legendre.leggauss(3)
-    weights = grid_points(node_weights, count).prod(axis=1)
-    points = np.vstack([grid_points(nodes, count), grid_points(np.array([-1.0, 1.0]), count)])
+    weights = grid_points(*[node_weights] * count).prod(axis=1)
+    points = np.vstack([grid_points(*[nodes] * count), grid_points(*[[-1.0, 1.0]] * count)])
     weighted = np.append(weights / weights.sum(), np.zeros(2**count))
     return Workspace(
-        read_only(_scale_to(limits, points, tool_at_zero(robot))),
+        read_only(_scale_to(limits, points, robot)),
         read_only(weighted),
         limits,
         letters=coordinate_letters(robot),
@@ -353,10 +353,10 @@ def coordinate_letters(robot: Robot) -> str:
     return "xyz" if robot.tcp is None else "".join("xyz"[c] for c in robot.tcp.coordinates)
 
 
-def _scale_to(box: Array, points: Array, zero: Array) -> Array:
-    """Map points of [−1, 1]ⁿ to tool positions in a box around the zero, [m]."""
+def _scale_to(box: Array, points: Array, robot: Robot) -> Array:
+    """Map points of [−1, 1]ⁿ to tool positions in a box around the mechanical zero, [m]."""
     centre, half = 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
-    return np.asarray(zero + centre + half * points)
+    return np.asarray(tool_at_zero(robot) + centre + half * points)
 
 
 def _lobatto_points(count: int) -> Array:
@@ -372,6 +372,6 @@ def _lobatto_points(count: int) -> Array:
     return np.asarray(0.5 * (points - points[::-1]))  # symmetric, without rounding errors
 
 
-def grid_points(nodes: Array, count: int) -> Array:
-    """Tensor grid of nodes, shape (n,): points, shape (n^count, count), last varying fastest."""
-    return np.stack(np.meshgrid(*[nodes] * count, indexing="ij"), axis=-1).reshape(-1, count)
+def grid_points(*lines: ArrayLike) -> Array:
+    """Tensor grid of the numbers along each coordinate: points as rows, the last varies fastest."""
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))

@@ -44,7 +44,6 @@ def schedule_readings(
     *,
     temperatures: tuple[float, float] | None = None,
     durations: Mapping[str, tuple[float, float]] | None = None,
-    start: datetime = MORNING,
 ) -> Session:
     """Session with times of successive readings, and temperatures that change linearly with time.
 
@@ -56,7 +55,6 @@ def schedule_readings(
             temperature by default.
         durations: Names of gauges, mapped to the time to mount the gauge and the time of a reading,
             [min]; usual times by default.
-        start: Time of the first reading.
     """
     lines = gather_points(session.readings, session.setups)
     names = {n: names_in_files(s) for n, s in session.setups.items()}
@@ -77,7 +75,7 @@ def schedule_readings(
             conditions = Conditions(
                 None if reading.conditions is None else reading.conditions.approach,
                 round(float(temperature), 1),
-                start + timedelta(minutes=float(minute)),
+                MORNING + timedelta(minutes=float(minute)),
             )
             reading = replace(reading, conditions=conditions)
         readings.append(reading)

@@ -122,18 +122,13 @@ class Observations:
 
     def only(self, chosen: Mask) -> Observations:
         """Masked entries, without the rows of the session."""
-        no_rows = np.empty(0, dtype=np.int64)
+        of_entries = ("setup", "posture", "zero", "state", "second", "place")
         return replace(
             self,
-            setup=self.setup[chosen],
-            posture=self.posture[chosen],
-            state=self.state[chosen],
-            second=self.second[chosen],
-            place=self.place[chosen],
+            **{name: getattr(self, name)[chosen] for name in of_entries},
             conditions={c: v[chosen] for c, v in self.conditions.items()},
-            zero=self.zero[chosen],
-            plus=no_rows,
-            minus=no_rows,
+            plus=np.empty(0, dtype=np.int64),
+            minus=np.empty(0, dtype=np.int64),
         )
 
     def sum_by_zero(self, values: Array, weights: Array) -> Array:
@@ -215,27 +210,24 @@ def build_observations(session: Session) -> Observations:
         return nodes[node]
 
     for r in session.readings:
-        if r.minus is None:
-            plus.append(add(r, r.posture, (r.setup,)))
-            minus.append(-1)
-        elif not session.is_difference(r):
-            plus.append(add(r, r.posture, (r.setup,)))
-            pairs[plus[-1]] = postures[r.minus]
-            minus.append(-1)
-        else:
+        if r.minus is not None and session.is_difference(r):
             plus.append(find_or_add(r, r.posture))
             minus.append(find_or_add(r, r.minus))
+            continue
+        plus.append(add(r, r.posture, (r.setup,)))
+        minus.append(-1)
+        if r.minus is not None:
+            pairs[plus[-1]] = postures[r.minus]
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
     values, states, state, second = _observe(session, conditions, table, pairs)
-    zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
     absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
     return Observations(
         setup=table[:, 0],
         posture=table[:, 1],
         zero=table[:, 2],
         n_zeros=len(zeros),
-        zero_setup=zero_setup,
-        zero_real=zero_real,
+        zero_setup=tuple(k[0] for k in zeros),
+        zero_real=tuple(len(k) == 1 for k in zeros),
         zero_known=np.array(absolute, dtype=np.bool_),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),

@@ -61,7 +61,7 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
             of_setup.append(())
             continue
         setup_parameters = [
-            Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.prior_std, ())
+            Parameter(_full_name(u, setup, session), u.unit, u.prior_std, ())
             for u in setup.sensor.nuisance_parameters
         ]
         setup_parameters += [
@@ -75,7 +75,7 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
         of_setup.append(tuple(index[p.name] for p in setup_parameters))
         vector = mirrored_parameters(setup.sensor)
         if vector:
-            mirrored[tuple(f"{_owner(p, setup, session)}.{p.name}" for p in vector)] = None
+            mirrored[tuple(_full_name(p, setup, session) for p in vector)] = None
     return NuisanceParameters(
         tuple(parameters.values()),
         tuple(of_setup),
@@ -85,12 +85,14 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
 
 def nominal_values(session: Session) -> dict[str, float]:
     """Nuisance parameter to the nominal value of its quantity, [unit], if that is not 0."""
-    return {
-        f"{_owner(p, setup, session)}.{p.name}": p.nominal
-        for setup in session.setups.values()
-        for p in setup.sensor.nuisance_parameters
-        if p.nominal
-    }
+    return {name: p.nominal for _, p, name in _list_parameters(session) if p.nominal}
+
+
+def _list_parameters(session: Session) -> Iterator[tuple[Setup, NuisanceParameter, str]]:
+    """Nuisance parameters of the sensors of all setups, with their names in the session."""
+    for setup in session.setups.values():
+        for p in setup.sensor.nuisance_parameters:
+            yield setup, p, _full_name(p, setup, session)
 
 
 def shared_gauge_parameters(session: Session, measured: Session) -> dict[str, str]:
@@ -111,36 +113,31 @@ def _gauge_parameters(session: Session) -> Iterator[tuple[tuple[str, str, float]
         parameter; and its name in the session.
     """
     read = {r.setup for r in session.readings}
-    for setup in session.setups.values():
-        _, gauge = split_label(setup.gauge, joined=session.joined)
-        for p in setup.sensor.nuisance_parameters:
-            if p.of_gauge and setup.name in read:
-                yield (gauge, p.name, p.nominal), f"{_owner(p, setup, session)}.{p.name}"
+    for setup, p, name in _list_parameters(session):
+        if p.of_gauge and setup.name in read:
+            _, gauge = split_label(setup.gauge, joined=session.joined)
+            yield (gauge, p.name, p.nominal), name
 
 
-def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
-    """Owner of a nuisance parameter: a gauge, an object that setups share, or the setup."""
+def _full_name(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
+    """Name after the owner of a parameter: a gauge, an object that setups share, or the setup."""
+    label, base = split_label(setup.name, joined=session.joined)
+    owner = f"setup.{setup.name}"
     if parameter.of_gauge:
         gauge = _shared_gauge(parameter, setup, session)
-        return f"gauge.{gauge}" if gauge else "gauge"
-    if parameter.shared_by is not None:
-        label, _ = split_label(setup.name, joined=session.joined)
-        return f"{label}/{parameter.shared_by}" if label else parameter.shared_by
-    if parameter.fixed and session.firmware is not None:
-        return f"setup.{split_label(setup.name, joined=session.joined)[1]}"
-    return f"setup.{setup.name}"
+        owner = f"gauge.{gauge}" if gauge else "gauge"
+    elif parameter.shared_by is not None:
+        owner = f"{label}/{parameter.shared_by}" if label else parameter.shared_by
+    elif parameter.fixed and session.firmware is not None:
+        owner = f"setup.{base}"
+    return f"{owner}.{parameter.name}"
 
 
 def fixed_parameters(session: Session) -> set[str]:
     """Nuisance parameters of parts of a printer, which all its logs share."""
     if session.firmware is None:
         return set()
-    return {
-        f"{_owner(p, setup, session)}.{p.name}"
-        for setup in session.setups.values()
-        for p in setup.sensor.nuisance_parameters
-        if p.fixed
-    }
+    return {name for _, p, name in _list_parameters(session) if p.fixed}
 
 
 def _shared_gauge(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:

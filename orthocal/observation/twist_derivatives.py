@@ -7,7 +7,6 @@ Machine parameters θ̂ change placements by twists ∂ξ/∂θ̂. `ClosurePatte
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -86,20 +85,15 @@ class ClosurePattern:
         """
         n_sets = max(len(twists), len(nonzeros))
         result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
-        for row, part in self._row_slices(n_rows):
+        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
+        for row, (first, end) in enumerate(itertools.pairwise(starts)):
+            part = slice(first, end)
             factors = twists[:, :, self.columns[part]]
             if twists.shape[1] == 1:
                 result[..., row] = (nonzeros[..., part] @ np.swapaxes(factors, 1, 2))[..., 0]
             else:
                 result[..., row] = (nonzeros[..., part] * factors).sum(axis=-1)
         return result
-
-    def _row_slices(self, n_rows: int) -> Iterator[tuple[int, slice]]:
-        """Rows with nonzeros, and the slice of the nonzeros of each."""
-        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
-        for row, (first, end) in enumerate(itertools.pairwise(starts)):
-            if end > first:
-                yield row, slice(first, end)
 
 
 class TwistChain:

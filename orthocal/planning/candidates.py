@@ -17,13 +17,13 @@ from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import grid_points, tool_at_zero
 from orthocal.measurement.motion.approach import possible_approaches
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.planning.equipment import Equipment, choose_box, place_reachable
+from orthocal.planning.equipment import Equipment, choose_box, indicators, place_reachable
 from orthocal.planning.expected_error import ENTERED_OFFSET_STD
 from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import PLACE, list_tool_candidates
@@ -427,9 +427,8 @@ def _add_postures(
             values = np.linspace(low, high, equipment.along if along else POSITIONS_ACROSS)
             values = np.round(values / POSITION_STEP) * POSITION_STEP + _phases(robot, values.size)
             coordinate_values.append(np.unique(np.clip(values, low, high).round(9)))
-    points = np.stack(np.meshgrid(*coordinate_values, indexing="ij"), axis=-1)
-    points = points.reshape(-1, len(coordinate_values))
-    points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
+    points = grid_points(*coordinate_values).round(9)
+    points = np.unique(np.vstack([np.clip(middle, *box.T), points]), axis=0)
     placed = place_reachable(robot, points, middle)
     if len(placed) < MIN_READINGS:
         within = " and within the soft limits" if equipment.soft_limits else ""
@@ -477,12 +476,7 @@ def _with_lateral_positions(session: Session) -> Session:
 
     A very wide blade locates the contact with the rod in every posture.
     """
-    robot, wide = session.robot, Tip("blade", 0.0, 10.0)
-    sensors = {
-        name: sensor
-        for name, setup in session.setups.items()
-        if (sensor := indicator_of(setup)) is not None
-    }
+    robot, wide, sensors = session.robot, Tip("blade", 0.0, 10.0), indicators(session)
     on_rods = {
         n: replace(session.setups[n], sensor=s.on_rod(s.rod, wide))
         for n, s in sensors.items()
@@ -512,11 +506,6 @@ def _with_lateral_positions(session: Session) -> Session:
             setups[new_name] = replace(session.setups[name], name=new_name, sensor=displaced)
             readings += [Reading(new_name, r.posture) for r in near]
     return replace(session, setups=setups, readings=tuple(readings))
-
-
-def indicator_of(setup: Setup) -> LegIndicator | None:
-    """Indicator of a setup at a leg; None for another sensor."""
-    return setup.sensor if isinstance(setup.sensor, LegIndicator) else None
 
 
 def _max_lateral_distance(sensor: LegIndicator, robot: Robot) -> float:

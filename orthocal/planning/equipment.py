@@ -162,7 +162,13 @@ class Equipment:
         )
 
 
-@cached_per_robot(maxsize=8)
+def indicators(session: Session) -> dict[str, LegIndicator]:
+    """Indicators at the legs, by setup."""
+    sensors = {name: setup.sensor for name, setup in session.setups.items()}
+    return {name: s for name, s in sensors.items() if isinstance(s, LegIndicator)}
+
+
+@cached_per_robot
 def find_box(robot: Robot) -> Array:
     """Limits of the tool along each coordinate through the mechanical zero, at most ±100 mm.
 
@@ -348,9 +354,7 @@ def equipment_of(session: Session, equipment: Equipment) -> Equipment:
         SessionError: If the repeatability of the readings is unknown.
     """
     session = state_noise(session)
-    at_legs = {
-        name: s.sensor for name, s in session.setups.items() if isinstance(s.sensor, LegIndicator)
-    }
+    at_legs = indicators(session)
     if not at_legs:
         return equipment
     # sensors that touch rods come first

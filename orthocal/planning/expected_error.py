@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -50,7 +50,7 @@ Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D"]
 worst point with translation and rotation removed. A, D: trace or determinant of the covariance of
 the parameters, in prior std."""
 
-CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D")
+CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
 
 WORST_POWER = 8.0
 """Exponent of the power mean that approximates the largest variance of the points."""
@@ -424,13 +424,10 @@ def _root(field: Array, weights: Array) -> Array:
 def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
     """Problem with noise ratios from the stated repeatability of the gauges."""
     session = problem.session
-    groups = split_by_gauge(session, problem.observations)
-    if len(groups) < 2:
+    if len(session.gauges_with_readings) < 2:
         return problem
-    noise = np.ones(problem.observations.size)
-    for group in groups:
-        noise[group.entries] = stated_sigma(group.gauge) / stated_sigma(session.gauge)
-    return problem.with_noise_ratio(noise)
+    noise = np.array([stated_sigma(session.gauges[s.gauge]) for s in session.setups.values()])
+    return problem.with_noise_ratio(noise[problem.observations.setup] / stated_sigma(session.gauge))
 
 
 def state_noise(session: Session) -> Session:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
-from typing import NamedTuple
 
 from orthocal.assessment.effect_limits import EffectLimits
 from orthocal.assessment.effect_separability import WARMER
@@ -32,22 +31,12 @@ class FurtherReadings:
     readings: int
     minutes: float
     """Additional time, [min]."""
-    warmer: float
-    """Temperature rise of the machine in a second round of the plan, [K]; 0 without one."""
-    wait: float
-    """Time after the last reading of each setup when its first posture is read again, [min]."""
-    gain: float
-    """Relative reduction of the tool error, to first order about the nominal machine."""
-
-
-class _Extension(NamedTuple):
-    """Plan with further readings; numbers as in `FurtherReadings`."""
-
-    session: Session
-    readings: int
-    minutes: float
     warmer: float = 0.0
+    """Temperature rise of the machine in a second round of the plan, [K]; 0 without one."""
     wait: float = 0.0
+    """Time after the last reading of each setup when its first posture is read again, [min]."""
+    gain: float = 0.0
+    """Relative reduction of the tool error, to first order about the nominal machine."""
 
 
 def find_further_readings(
@@ -69,8 +58,8 @@ def find_further_readings(
         if limit.determined:
             continue
         further = None
-        for extension in _extensions(comparison, conditions[limit.effect]):
-            further = _evaluate(comparison, extension, limit)
+        for session, proposed in _extensions(comparison, limit, conditions[limit.effect]):
+            further = _evaluate(comparison, session, proposed)
             if further.limit.determined:
                 break
         if further is not None and further.limit.after < limit.after:
@@ -79,36 +68,32 @@ def find_further_readings(
 
 
 def _evaluate(
-    comparison: Comparison, extension: _Extension, limit: EffectLimits
+    comparison: Comparison, session: Session, further: FurtherReadings
 ) -> FurtherReadings:
-    """Limit of an effect after further readings, and their gain at the tool."""
+    """Further readings with the limit of the effect after them, and their gain at the tool."""
     forecast, plan = comparison.forecast, comparison.equipment.schedule(comparison.plan)
-    session = comparison.join(extension.session)
+    session, limit = comparison.join(session), further.limit
     limits = forecast.limits(session)
     after = next(e for e in limits if (e.effect, e.unit) == (limit.effect, limit.unit))
     sessions = session, comparison.join(plan)
     tool, without = (forecast.about_nominal(s).reported.rms for s in sessions)
-    return FurtherReadings(
-        limit=after,
-        readings=extension.readings,
-        minutes=extension.minutes,
-        warmer=extension.warmer,
-        wait=extension.wait,
-        gain=1.0 - tool / without,
-    )
+    return replace(further, limit=after, gain=1.0 - tool / without)
 
 
-def _extensions(comparison: Comparison, conditions: Sequence[Condition]) -> Iterator[_Extension]:
-    """Plans with further readings for an effect, the shortest first."""
+def _extensions(
+    comparison: Comparison, limit: EffectLimits, conditions: Sequence[Condition]
+) -> Iterator[tuple[Session, FurtherReadings]]:
+    """Plans with further readings for an effect, and these readings, the shortest first."""
     plan = comparison.equipment.schedule(comparison.plan)
     rows = one_row_per_point(plan)
     setups, readings = len(rows.setups), len(rows.readings)
     if "temperature" in conditions:
         minutes = comparison.equipment.minutes_of(plan)
-        yield _Extension(_read_again_warmer(plan), readings, minutes, warmer=WARMER)
+        yield _read_again_warmer(plan), FurtherReadings(limit, readings, minutes, WARMER)
     if "time" in conditions:
         for wait in WAITING_TIMES:
-            yield _Extension(_read_again_later(plan, wait), setups, wait * setups, wait=wait)
+            further = FurtherReadings(limit, setups, wait * setups, wait=wait)
+            yield _read_again_later(plan, wait), further
 
 
 def _read_again_warmer(plan: Session) -> Session:

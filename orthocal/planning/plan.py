@@ -22,7 +22,6 @@ from orthocal.measurement.motion.approach import usual_approaches
 from orthocal.planning.candidates import (
     MIN_READINGS,
     Candidates,
-    indicator_of,
     list_candidates,
     measure_candidates,
 )
@@ -34,7 +33,7 @@ from orthocal.planning.cost_curve import (
     find_scale,
     scale_curve,
 )
-from orthocal.planning.equipment import Equipment
+from orthocal.planning.equipment import Equipment, indicators
 from orthocal.planning.expected_error import (
     CRITERIA,
     Criterion,
@@ -288,11 +287,12 @@ def _plan(
         improved = timed.improve(setups, counts_or_minutes)
     else:
         improved = search.improve(setups)
-    expected = compare(improved).expect_plan()
-    best = (
-        improved if is_less(expected.rms_by(options.criterion), error) else search.plan_of(setups)
-    )
-    return _evaluate(timed, best, compare(best), options)
+    comparison = compare(improved)
+    expected = comparison.expect(comparison.plan)
+    if not is_less(expected.rms_by(options.criterion), error):
+        improved = search.plan_of(setups)
+        comparison = compare(improved)
+    return _evaluate(timed, improved, comparison, options)
 
 
 def _search_setups(
@@ -428,7 +428,7 @@ def _evaluate(
                     lambda: compute_curve(search, each, setups),
                     comparison.list_alternatives,
                     comparison.list_usual_plans,
-                    comparison.expect_plan,
+                    lambda: comparison.expect(plan),
                     lambda: forecast.after(joined, entered=False),
                     lambda: forecast.about_nominal(joined),
                     lambda: (
@@ -545,29 +545,25 @@ def _simplify(
     A goal that the plan reaches for the parameters of the approach is still reached.
     """
     session, setups = candidates.session, candidates.setups
-
-    indicators = {
-        which: sensor
-        for which, setup in enumerate(setups)
-        if (sensor := indicator_of(session.setups[setup.name])) is not None
-    }
+    at_legs = indicators(session)
+    sensors = {i: at_legs[s.name] for i, s in enumerate(setups) if s.name in at_legs}
 
     def distance(which: int) -> float:
-        return float(np.linalg.norm(indicators[which].beside))
+        return float(np.linalg.norm(sensors[which].beside))
 
     def without_lateral(which: int) -> LegIndicator:
-        return replace(indicators[which], beside=(0.0, 0.0, 0.0))
+        return replace(sensors[which], beside=(0.0, 0.0, 0.0))
 
     max_error = (1.0 + SIMPLICITY_TOLERANCE) * planned.error
     reached = _is_reached(planned, of_approach)
     for k, old in enumerate(planned.setups):
-        if old.candidate not in indicators:
+        if old.candidate not in sensors:
             continue
         candidate = setups[old.candidate]
         postures = [session.readings[i].place[1:] for i in candidate.rows[list(old.chosen)]]
         base = without_lateral(old.candidate)
         others = planned.information - search.information_of(old)
-        for which in sorted(indicators, key=distance):
+        for which in sorted(sensors, key=distance):
             if distance(which) >= distance(old.candidate):
                 break
             if without_lateral(which) != base:

@@ -10,8 +10,8 @@ import numpy as np
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.joining import join_sessions
-from orthocal.planning.candidates import MIN_READINGS, Candidates, CandidateSetup, indicator_of
-from orthocal.planning.equipment import Equipment
+from orthocal.planning.candidates import MIN_READINGS, Candidates, CandidateSetup
+from orthocal.planning.equipment import Equipment, indicators
 from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.planning.planned_session import build_session
 from orthocal.planning.selection import PlannedSetup
@@ -103,18 +103,14 @@ class Comparison:
         chosen = np.searchsorted(setup.rows, rows).tolist()
         return PlannedSetup(self.candidates.setups.index(setup), tuple(chosen))
 
-    def expect_plan(self) -> Expected:
-        """Expected tool error after the plan."""
-        return self._expect(self.plan)
-
-    def _expect(self, session: Session) -> Expected:
+    def expect(self, session: Session) -> Expected:
         """Expected tool error after planned readings, joined with the existing ones."""
         joined = self.join(self.equipment.schedule(session))
         return self.forecast.after(joined, entered=self.entered)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
         """The plan with a finer dial, a blade, or one square block per leg."""
-        sensors = [s for s in map(indicator_of, self.plan.setups.values()) if s is not None]
+        sensors = indicators(self.plan).values()
         if not sensors:
             return ()
         changes: list[tuple[str, Callable[[Session], Session]]] = [
@@ -134,14 +130,15 @@ class Comparison:
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
         """Alternative with its expected tool error."""
         minutes, rows = self.equipment.minutes_of(session), one_row_per_point(session)
-        expected = self._expect(session) if in_range else None
+        expected = self.expect(session) if in_range else None
         return Alternative(name, len(rows.setups), len(rows.readings), minutes, expected)
 
     def _middle_setups(self) -> list[CandidateSetup]:
         """Setup nearest to the middle of each leg in each direction, with the tip on the rod."""
         best: dict[tuple[str, object], tuple[float, CandidateSetup]] = {}
+        at_legs = indicators(self.candidates.session)
         for setup in self.candidates.setups:
-            sensor = indicator_of(self.candidates.session.setups[setup.name])
+            sensor = at_legs.get(setup.name)
             if sensor is None or any(sensor.beside):
                 continue
             key = (sensor.leg, sensor.direction)
@@ -197,7 +194,7 @@ def _evenly(line: Sequence[int], zero: int, count: int) -> list[int]:
 def _with_finer_dial(session: Session) -> Session:
     """Session with finer gauges at the legs."""
     gauges = dict(session.gauges)
-    for name in {s.gauge for s in session.setups.values() if indicator_of(s) is not None}:
+    for name in {session.setups[n].gauge for n in indicators(session)}:
         old = gauges[name]
         sigma, resolution = (
             None if v is None else FINE_DIAL_FACTOR * v for v in (old.sigma, old.resolution)
@@ -208,27 +205,22 @@ def _with_finer_dial(session: Session) -> Session:
 
 def _with_blocks(session: Session) -> Session:
     """Session in which all gauges of a leg are mounted on one square block."""
-
-    def on_block(s: LegIndicator) -> LegIndicator:
-        return replace(s, mounting=replace(s.mounting, stand=f"block_{s.leg}"))
-
-    return _with_sensors(session, on_block)
+    return _with_sensors(
+        session, lambda s: replace(s, mounting=replace(s.mounting, stand=f"block_{s.leg}"))
+    )
 
 
 def _with_blade(session: Session) -> Session:
     """Session in which all gauges at rods have a blade."""
-
-    def with_blade(s: LegIndicator) -> LegIndicator:
-        return s if s.rod is None else s.on_rod(s.rod, BLADE, s.beside)
-
-    return _with_sensors(session, with_blade)
+    return _with_sensors(
+        session, lambda s: s if s.rod is None else s.on_rod(s.rod, BLADE, s.beside)
+    )
 
 
 def _with_sensors(session: Session, change: Callable[[LegIndicator], LegIndicator]) -> Session:
     """Session with changed indicators at the legs."""
     changed = {
-        name: replace(setup, sensor=change(sensor))
-        for name, setup in session.setups.items()
-        if (sensor := indicator_of(setup)) is not None
+        name: replace(session.setups[name], sensor=change(sensor))
+        for name, sensor in indicators(session).items()
     }
     return replace(session, setups={**session.setups, **changed})

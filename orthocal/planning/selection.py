@@ -19,9 +19,15 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import MIN_READINGS, AlignedParameter, Candidates, CandidateSetup
-from orthocal.planning.information_gain import Gain, Pairs, PointGain, SetupGain
+from orthocal.planning.information_gain import (
+    Gain,
+    Pairs,
+    PointGain,
+    SetupGain,
+    SetupStack,
+    stack_setups,
+)
 from orthocal.planning.ranking import first_largest, is_less, sort_by
-from orthocal.planning.setup_stack import SetupStack, stack_setups
 from orthocal.runtime.threads import one_thread
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM

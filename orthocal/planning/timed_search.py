@@ -131,16 +131,14 @@ class TimedSearch:
         return best
 
     def _run_start(self, minutes: float, starts: Sequence[str | None], which: int) -> PlannedSetups:
-        return self.run(minutes, starts[which])
-
-    def run(self, minutes: float, first: str | None) -> PlannedSetups:
         """Setups of one start.
 
         Args:
             minutes: Available time.
-            first: Gauge of the first setup; None for the setup of largest gain per minute.
+            starts: Gauge of the first setup of each start; None for the largest gain per minute.
+            which: Index of the start.
         """
-        setups = []
+        setups, first = [], starts[which]
         if first is not None:
             with one_thread():
                 options = self._list_options(self.search.empty, 0.5 * minutes)

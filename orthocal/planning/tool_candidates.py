@@ -15,7 +15,7 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.kinematics.tool_rotation import place_turning
-from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
+from orthocal.kinematics.workspace import grid_points, position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import (
     name_approach,
     possible_approaches,
@@ -80,6 +80,9 @@ STEP = 5 * MM
 
 PLACE = "@"
 """Mark before the place of a sensor in the name of a candidate setup."""
+
+Placements = Iterator[tuple[str, dict[str, Any], Array]]
+"""Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement of a sensor."""
 
 
 def list_tool_candidates(
@@ -209,7 +212,7 @@ class _Positions:
         for rod in self.robot.rods.values():
             ends = (poses(frame)[:, :3, 3] for frame in (rod.root, rod.tip))
             clear &= segment_distances(ball, fixed, *ends) >= rod.radius + radius
-        return [name for name, is_clear in zip(names, clear, strict=True) if is_clear]
+        return list(itertools.compress(names, clear))
 
     def approached(
         self, sensor: Sensor, names: Sequence[str]
@@ -268,13 +271,8 @@ def segment_distances(start: Array, end: Array, other_start: Array, other_end: A
     return np.asarray(np.linalg.norm(nearest, axis=1))
 
 
-def _places(
-    sensor: OwnedSensor, robot: Robot, middle: Array, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement.
-
-    Positions are within the box, except for the height of a bed.
-    """
+def _places(sensor: OwnedSensor, robot: Robot, middle: Array, box: Array) -> Placements:
+    """Placements of a sensor, with positions in the box, except for the height of a bed."""
     if sensor.keys["sensor"] == "ball_bar":
         return _bars(sensor, robot, box)
     places = {
@@ -289,9 +287,7 @@ def _places(
     return places[kind](sensor, np.clip(middle, *box.T), box)
 
 
-def _bars(
-    sensor: OwnedSensor, robot: Robot, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
+def _bars(sensor: OwnedSensor, robot: Robot, box: Array) -> Placements:
     """Ball bars about fixed balls: circles in planes through the ball and at both sides of it.
 
     A tool that moves in a plane has one circle about a ball in this plane.
@@ -337,9 +333,7 @@ def _is_inclined(sensor: OwnedSensor, bars: Array) -> Mask:
     return np.asarray((elevation >= low - SAME_ANGLE) & (elevation <= high + SAME_ANGLE))
 
 
-def _beds(
-    sensor: OwnedSensor, middle: Array, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
+def _beds(sensor: OwnedSensor, middle: Array, box: Array) -> Placements:
     """Points on a bed through the origin of the world."""
     axis = "xyz".index(str(sensor.keys.get("direction", "-z"))[-1])
     tip = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0)))[axis] * MM
@@ -348,19 +342,14 @@ def _beds(
     yield sensor.name, {}, points
 
 
-def _points(
-    sensor: OwnedSensor, middle: Array, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
+def _points(sensor: OwnedSensor, middle: Array, box: Array) -> Placements:
     """Positions of a target in a box."""
     del middle
     lines = [_round(np.linspace(low, high, LINE_POINTS), low, high) for low, high in box.tolist()]
-    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
-    yield sensor.name, {}, points
+    yield sensor.name, {}, grid_points(*lines)
 
 
-def _edges(
-    sensor: OwnedSensor, middle: Array, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
+def _edges(sensor: OwnedSensor, middle: Array, box: Array) -> Placements:
     """Edges along each axis, touched across it; both arms of a square share its plane."""
     artefact = dict(sensor.keys["artefact"])
     length = float(artefact.get("length_mm", 200.0)) * MM
@@ -379,9 +368,7 @@ def _edges(
             yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}{PLACE}{k}", keys, points
 
 
-def _plates(
-    sensor: OwnedSensor, middle: Array, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
+def _plates(sensor: OwnedSensor, middle: Array, box: Array) -> Placements:
     """Plates across each axis."""
     length = float(sensor.keys["artefact"].get("length_mm", 200.0)) * MM
     for axis in range(3):
@@ -391,9 +378,7 @@ def _plates(
             yield f"{sensor.name}{'xyz'[axis]}{PLACE}{k}", {"direction": f"-{'xyz'[axis]}"}, points
 
 
-def _blocks(
-    sensor: OwnedSensor, middle: Array, box: Array
-) -> Iterator[tuple[str, dict[str, Any], Array]]:
+def _blocks(sensor: OwnedSensor, middle: Array, box: Array) -> Placements:
     """Positions beside a gauge block and on it, along each axis in which it fits into the box."""
     artefact = dict(sensor.keys["artefact"])
     height = float(artefact.get("height_mm", 0.0)) * MM
@@ -431,5 +416,4 @@ def _round(positions: ArrayLike, low: float, high: float) -> Array:
 def _grid(middle: Array, box: Array, axis: int, length: float, count: int) -> Array:
     """Positions on a square perpendicular to an axis, shape (n, 3), [m]."""
     sides = [_line(middle, box, k, length, count) for k in range(3) if k != axis]
-    pairs = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.insert(pairs, axis, middle[axis], axis=1)
+    return np.insert(grid_points(*sides), axis, middle[axis], axis=1)

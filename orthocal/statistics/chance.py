@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +14,6 @@ from orthocal.statistics.distributions import (
     f_tail,
     incomplete_beta,
     least_number,
-    normal_quantile,
     t_quantile,
 )
 
@@ -66,7 +66,7 @@ def confidence_factor(dof: float, level: float = 0.95) -> float:
     """Half width of a confidence interval, in standard deviations."""
     tail = 0.5 + level / 2.0
     if math.isinf(dof):
-        return normal_quantile(tail)
+        return NormalDist().inv_cdf(tail)
     return t_quantile(dof, tail) if dof > 0 else float("inf")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Annotated
 
 import numpy as np
@@ -172,8 +173,8 @@ def analyse_identifiability(
         n_postures=n_postures,
         n_readings=n_readings,
         n_nuisance=n_nuisance,
-        below_noise=tuple(n for n, size in zip(names, norms, strict=True) if size <= threshold),
-        resolvable=tuple(n for n, ok in zip(names, resolvable, strict=True) if ok),
+        below_noise=tuple(compress(names, norms <= threshold)),
+        resolvable=tuple(compress(names, resolvable)),
         alike=_find_alike(factor, parameters, threshold),
         base=find_base_parameters(factor, parameters, threshold=threshold),
     )
@@ -239,7 +240,7 @@ def _find_alike(
         # half of the digits cancel in a difference of squares
         floor = (1e-7 * norms[others]) ** 2
         proportional = square <= np.maximum(threshold**2, floor)
-        members = sorted([lead, *(i for i, ok in zip(others, proportional, strict=True) if ok)])
+        members = sorted([lead, *compress(others, proportional)])
         if len(members) > 1:
             first = members[0]
             terms = []
@@ -248,5 +249,5 @@ def _find_alike(
                 ratio = scaled * parameters[first].prior_std / parameters[i].prior_std
                 terms.append((parameters[i].name, float(ratio)))
             groups.append((first, Combination(tuple(terms))))
-        pending = [i for i, ok in zip(others, proportional, strict=True) if not ok]
+        pending = list(compress(others, ~proportional))
     return tuple(c for _, c in sorted(groups, key=lambda f: f[0]))

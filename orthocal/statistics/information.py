@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import compress
 
 import numpy as np
 
@@ -169,11 +170,9 @@ class Posterior:
     @property
     def effective_parameters(self) -> float:
         """Effective number of parameters for squares, n − tr(P⁻¹ C); the rank without a prior."""
-        n_at_bound = int((~self.free).sum())
         if not self.precision.any():
-            return float(Information(self.factor).rank - n_at_bound)
-        used = len(self.free) - n_at_bound - self.precision @ np.diag(self.inverse_normal)
-        return float(used)
+            return float(Information(self.factor).rank - (~self.free).sum())
+        return float(self.free.sum() - self.precision @ np.diag(self.inverse_normal))
 
 
 def _inverse_square(matrix: Array) -> Array:
@@ -263,9 +262,7 @@ def require_identifiable(
     stacked = np.vstack([information.factor / largest, np.diag(precision)])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)
     null = directions[values <= RANK_THRESHOLD * values[0], : len(names)]
-    undetermined = tuple(
-        n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12
-    )
+    undetermined = tuple(compress(names, (null**2).sum(axis=0) > 1e-12))
     if undetermined:
         information = assume_others_known(information, len(names))
         advice = _advise(information, names, null)
@@ -290,16 +287,13 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
     without_effect = norms <= RANK_THRESHOLD * max(float(norms.max(initial=0.0)), 1e-300)
     sentences = []
     if without_effect.any():
-        names_without_effect = [
-            n for n, has_none in zip(names, without_effect, strict=True) if has_none
-        ]
         sentences.append(
-            f"No reading depends on {_list(names_without_effect)}: read the legs that are "
-            "missing, in postures along their own axes."
+            f"No reading depends on {_list(list(compress(names, without_effect)))}: read the legs "
+            "that are missing, in postures along their own axes."
         )
     # each row of the reduced echelon form is one unobservable change of the others
     null_rows = _reduce(null[:, ~without_effect])
-    other_names = [n for n, has_none in zip(names, without_effect, strict=True) if not has_none]
+    other_names = list(compress(names, ~without_effect))
     for row in null_rows[:MAX_DIRECTIONS]:
         order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
         terms = [i for i in order if abs(row[i]) > 1e-6]

@@ -196,24 +196,20 @@ def estimate_noise(
     cycles_sigma = max(cycles_sigma, noise_floor(None, resolution)) if cycles_dof else cycles_sigma
     has_dof = residual_dof > MIN_DOF
     residual_sigma = math.sqrt(residual_square / residual_dof) if has_dof else math.nan
+
+    def is_exceeded(sigma: float, dof: int) -> bool:
+        """True if residuals exceed a noise with degrees of freedom from cycles, 0 if stated."""
+        chi_square = residual_square / sigma**2
+        return chance_of_excess(chi_square, residual_dof, cycles_dof=dof) < BY_CHANCE
+
     source: NoiseSource
     if cycles_dof > 0:
-        reference, reference_dof = (
-            (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
-        )
-        misfit = False
-        if has_dof and reference > 0.0:
-            chi_square = residual_square / reference**2
-            misfit = (
-                chance_of_excess(chi_square, residual_dof, cycles_dof=reference_dof) < BY_CHANCE
-            )
+        reference = (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
+        misfit = has_dof and reference[0] > 0.0 and is_exceeded(*reference)
         source = "residuals" if misfit else "cycles"
     elif has_dof:
         few_dof = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
-        use_residuals = not few_dof or (
-            chance_of_excess(residual_square / floor**2, residual_dof) < BY_CHANCE
-        )
-        source = "residuals" if use_residuals else "gauge"
+        source = "gauge" if few_dof and not is_exceeded(floor, 0) else "residuals"
     else:
         source = "gauge" if gauge_sigma is not None else "unknown"
     sigma, dof = {

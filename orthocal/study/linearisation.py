@@ -7,7 +7,7 @@ equations alone. Noise and resolution serve as a comparison.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -22,9 +22,9 @@ from orthocal.estimation.linear import (
     SIX_ROWS,
     TWELVE_ROWS,
     LinearProblem,
+    invert_equation_8,
     leg_parallelism_matrix,
     linearise_problem,
-    solve_equation_8,
     twelve_row_covariance,
 )
 from orthocal.estimation.problem import CalibrationProblem, build_problem
@@ -101,18 +101,10 @@ class LinearisationStudy(Study):
             problem = with_gauge_noise(problem)  # readings are weighted as in a calibration
         linearisation = linearise_problem(problem)
         require_determined(problem, linearisation.information)
-        matrices, differences = {}, np.zeros((0, problem.observations.size))
+        paper = {}
         if self.displacements is not None:
-            differences = _paper_differences(problem.session)
-            for n in (6, 12):
-                matrices[n] = leg_parallelism_matrix(
-                    length=next(iter(problem.robot.legs.values())).length,
-                    displacement_max=self.displacements.maximum,
-                    displacement_min=self.displacements.minimum,
-                    rows=n,
-                )
-        program = VariableProjection(problem)
-        return _Prepared(problem, linearisation, program, matrices, differences)
+            paper = _paper_solutions(problem.session, self.displacements)
+        return _Prepared(problem, linearisation, VariableProjection(problem), paper)
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
         """Errors of each method's estimates, [mm or mrad]; None where the method fails."""
@@ -137,20 +129,9 @@ class _Prepared:
     problem: CalibrationProblem
     linearisation: LinearProblem
     program: VariableProjection
-    matrices: Mapping[int, Array]
-    """Number of rows to the paper's matrix; empty for other plans."""
-    differences: Array
-    """The paper's twelve differences of readings, shape (12, n_entries)."""
-
-    def paper_methods(self) -> Iterator[tuple[str, Array, Array | None]]:
-        """Name, differences of readings (n_rows, n_entries) and covariance of each paper method."""
-        if self.matrices:
-            twelve = self.differences
-            plus = [TWELVE_ROWS.index(f"{name}+") for name in SIX_ROWS]
-            minus = [TWELVE_ROWS.index(f"{name}-") for name in SIX_ROWS]
-            yield "six", twelve[plus] - twelve[minus], None
-            yield "twelve", twelve, None
-            yield "twelve_gls", twelve, twelve_row_covariance()
+    paper: Mapping[str, Array]
+    """Paper methods, mapped to matrices from single readings to offsets, shape (3, n_entries);
+    empty for other plans."""
 
     def identify(self, errors: Array) -> dict[str, list[Any]]:
         """Errors of each method's estimates.
@@ -168,13 +149,8 @@ class _Prepared:
             columns[name] = np.where(measurable, error, np.nan).tolist()
 
         change = readings - problem.predict(problem.active_theta, problem.active_passive)
-        for name, differences, covariance in self.paper_methods():
-            matrix = self.matrices[len(differences)]
-            unit_rows = np.eye(len(differences))  # the solution is linear in the differences
-            solutions = [
-                solve_equation_8(matrix, y, covariance=covariance).offsets for y in unit_rows
-            ]
-            add(name, change @ differences.T @ np.array(solutions))
+        for name, solution in self.paper.items():
+            add(name, change @ solution.T)
         centred = project_out_zeros(change.T, problem.observations).T
         unit_rows = np.vstack([np.zeros(centred.shape[1]), np.eye(centred.shape[1])])
         start, *rows = (replace(self.linearisation, residual=y).solve(sigma=1.0) for y in unit_rows)
@@ -260,14 +236,10 @@ class _Prepared:
             sigma: Standard deviation of a reading of the first gauge, [m]. The others have their
                 own, by which readings are weighted.
         """
-        errors = {}
-        for name, differences, covariance in self.paper_methods():
-            matrix = self.matrices[len(differences)]
-            whiten = np.eye(len(matrix))
-            if covariance is not None:
-                whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-            solution = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
-            errors[name] = sigma * float(np.sqrt((solution**2).sum(axis=1).max()))
+        errors = {
+            name: sigma * float(np.sqrt((solution**2).sum(axis=1).max()))
+            for name, solution in self.paper.items()
+        }
         jacobian = self.linearisation.jacobian / self.problem.theta_scale
         variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
         general = sigma * float(np.sqrt(variances.max()))
@@ -374,6 +346,27 @@ def _read_direction(along: Sequence[float], names: Sequence[str]) -> Array:
             where="--along",
         )
     return vector
+
+
+def _paper_solutions(session: Session, displacements: Displacements) -> dict[str, Array]:
+    """Matrix of each paper method from single readings to offsets, shape (3, n_entries)."""
+    differences = _paper_differences(session)
+    plus, minus = ([TWELVE_ROWS.index(f"{name}{sign}") for name in SIX_ROWS] for sign in "+-")
+    six, twelve = (
+        leg_parallelism_matrix(
+            length=next(iter(session.robot.legs.values())).length,
+            displacement_max=displacements.maximum,
+            displacement_min=displacements.minimum,
+            rows=n,
+        )
+        for n in (6, 12)
+    )
+    weighted = invert_equation_8(twelve, covariance=twelve_row_covariance())
+    return {
+        "six": invert_equation_8(six) @ (differences[plus] - differences[minus]),
+        "twelve": invert_equation_8(twelve) @ differences,
+        "twelve_gls": weighted @ differences,
+    }
 
 
 def _paper_differences(session: Session) -> Array:

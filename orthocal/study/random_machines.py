@@ -68,11 +68,6 @@ class MachineModel:
         """Standard deviations that weight the readings, shape (n_entries,), [m]."""
         return self.sigma * self.problem.noise_ratio
 
-    @property
-    def robot(self) -> Robot:
-        """Nominal robot with the effects of the model."""
-        return self.problem.robot
-
     def estimate(self, values: Array) -> tuple[Array, Mask]:
         """Estimate the errors of machines.
 
@@ -100,15 +95,6 @@ class MachineModel:
     def columns(self) -> Array:
         """Elementary errors per unit of each identified parameter, shape (n_errors, n_machine)."""
         return self.problem.functions.errors.unit_errors(self.problem.machine_selection.names)
-
-    def errors(self, theta: Array) -> Array:
-        """Elementary errors of estimates, shape (n_sets, n_errors), [SI].
-
-        Args:
-            theta: Free parameters, shape (n_sets, n_free), [SI].
-        """
-        estimated = theta[:, : self.problem.n_machine] @ self.columns.T
-        return np.asarray(self.problem.closure.errors() + estimated)
 
     def reorder_errors(self, errors: Array, names: Sequence[str]) -> Array:
         """Errors of a robot with other effects in the order of this model; 0 for missing ones.
@@ -138,7 +124,7 @@ class MachineModel:
 
     def explains(self, truth: CalibrationProblem) -> bool:
         """True if the model contains all errors of the machines, `truth`."""
-        if not set(truth.robot.effect_names) <= set(self.robot.effect_names):
+        if not set(truth.robot.effect_names) <= set(self.problem.robot.effect_names):
             return False
         columns = self.columns
         true_errors = self.reorder_errors(truth.errors_per_theta.T, truth.functions.errors.names).T
@@ -293,20 +279,18 @@ class RandomMachines:
         """
         truth, n = self.truth, self.truth.n_machine
         scaled = self.draw(number)[0] * truth.theta_scale
-        errors = truth.closure.errors(scaled[:n])
+        errors = truth.elementary_errors(scaled)
         identified = self.model.identified_part(errors[None], self.error_names)[0]
-        values = dict(zip(truth.free[n:], scaled[n:].tolist(), strict=True))
-        values |= dict(
-            zip(self.model.problem.machine_selection.names, identified.tolist(), strict=True)
-        )
+        values = dict(zip(truth.free[n:], scaled[n:], strict=True))
+        values |= zip(self.model.problem.machine_selection.names, identified, strict=True)
         return np.array([values.get(name, 0.0) for name in names])
 
     def measure(self, numbers: Sequence[int]) -> MeasuredMachines:
         """Random machines and their readings."""
         draws, generators = zip(*(self.draw(n) for n in numbers), strict=True)
-        theta, truth = np.array(draws), self.truth
-        observations = truth.observations
-        entries, _, closed = truth.simulate(theta * truth.theta_scale)
+        truth, observations = self.truth, self.truth.observations
+        theta = np.array(draws) * truth.theta_scale
+        entries, _, closed = truth.simulate(theta)
         status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
         for i, rng in enumerate(generators):
             entries[i], _ = show_readings(truth.session, observations, entries[i], rng=rng)
@@ -314,8 +298,7 @@ class RandomMachines:
         rows = np.array([observations.rows(v) for v in entries])
         out_of_range = (rows < self.limits[0]) | (rows > self.limits[1])
         set_reason(status, np.asarray(out_of_range.any(axis=1)), OUT_OF_RANGE)
-        errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.errors_per_theta.T
-        return MeasuredMachines(errors, entries, rows, status)
+        return MeasuredMachines(truth.elementary_errors(theta), entries, rows, status)
 
     def estimate(self, measured: MeasuredMachines) -> list[Array]:
         """Estimates by each model, shape (n_sets, n_free), [SI].
@@ -343,7 +326,10 @@ class RandomMachines:
         status = measured.status
         calibrated = np.flatnonzero(status == CALIBRATED)
         machines = [(self.truth.robot, measured.errors)]
-        machines += [(m.robot, m.errors(t)) for m, t in zip(self.models, estimates, strict=True)]
+        machines += [
+            (m.problem.robot, m.problem.elementary_errors(t))
+            for m, t in zip(self.models, estimates, strict=True)
+        ]
         tools = np.full((len(machines), *self.tool.positions.shape, len(status)), np.nan)
         for tool, (robot, errors) in zip(tools, machines, strict=True):
             if calibrated.size:

@@ -7,7 +7,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from numbers import Integral
 from operator import attrgetter
@@ -17,12 +17,10 @@ import numpy as np
 
 from orthocal import __version__
 from orthocal.arrays import Array
-from orthocal.effects.loading import load_robot_content, with_adjustments, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.measurement.files.point_rows import is_of_row
 from orthocal.measurement.files.write_session import session_document, session_tables
-from orthocal.robot.model import Robot
 from orthocal.runtime.threads import one_thread
 from orthocal.sensors.points import Points
 from orthocal.session.session import Session
@@ -48,7 +46,7 @@ class Study(ABC):
     cases_per_task: ClassVar[int] = 250
 
     session: Session
-    """Session of a nominal robot, which workers build from the robot's files."""
+    """Session of a nominal robot."""
 
     @property
     @abstractmethod
@@ -92,19 +90,6 @@ class Study(ABC):
         # in its order: that of setups and gauges decides on random numbers and units
         text = json.dumps(self.document, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
-
-    def __getstate__(self) -> dict[str, Any]:
-        robot, nothing = self.session.robot, cast(Robot, None)
-        content, tolerances = dict(robot.content), dict(robot.parameters.stated)
-        files = robot.name, content, robot.folder, tolerances, robot.chosen_effects, robot.adjusted
-        session = replace(self.session, robot=nothing, parts=())
-        return {**self.__dict__, "session": session, "files": files}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        name, content, folder, tolerances, effects, adjusted = state.pop("files")
-        robot = with_effects(load_robot_content(name, content, folder=folder), effects)
-        robot = (with_adjustments(robot) if adjusted else robot).with_tolerances(tolerances)
-        self.__dict__.update(state, session=replace(state["session"], robot=robot))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Study) and self.digest == other.digest

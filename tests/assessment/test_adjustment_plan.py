@@ -14,6 +14,7 @@ from calibrated import UNJUDGED, identified, session_of
 from commands import orthocal as run
 
 from orthocal import (
+    Choice,
     calibrate,
     draw_errors,
     plan_adjustments,
@@ -24,6 +25,7 @@ from orthocal import (
 from orthocal.assessment.adjustment_plan import LEAST_GAIN, _Search
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.assessment.tool_error import measure_deviations
 from orthocal.assessment.words.adjustment import HEADLINES
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.effects.adjustment import find_adjustments
@@ -171,6 +173,22 @@ def test_an_adjusted_calibration_is_the_machine_with_its_amounts(calibration):
     one = next(a for a in find_adjustments(calibration.robot) if a.name == "x_outer_foot_z")
     assert grown == pytest.approx((terms["x_slide.ry"] * one.setting_std(0.3e-3)) ** 2, rel=1e-6)
     assert adjust_calibration(calibration, {}) is calibration
+
+
+def test_adjustments_are_planned_if_no_offset_is_identified(plan):
+    rotations = ("*_slide.r?",)
+    errors = draw_errors(plan.robot, rotations, seed=SEED)
+    session = simulate_session(plan, errors, seed=SEED, sigma=3e-6).session
+    fitted = identified(session, Choice(free=rotations, prior=True))
+    planned = plan_adjustments(fitted)
+    adjusted = find_tool(adjust_calibration(fitted, planned.amounts))
+    deviation = measure_deviations(
+        adjusted.deviation(np.zeros(3)), adjusted.workspace, adjusted.targets
+    )
+    expected = np.hypot(deviation.reported.rms, planned.before.compensated)
+    assert planned.entries == ()
+    assert planned.gain > LEAST_GAIN
+    assert planned.after.entered == pytest.approx(expected, rel=0.01)
 
 
 def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):

@@ -25,7 +25,7 @@ def session():
 
 def describe_alternatives(session, explanation, alternative):
     anomaly = Anomaly(explanation, 9.0, None, alternatives=(alternative,))
-    found = Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
+    found = Anomalies((anomaly,), True, 1e-4, 1e-5, 1.0)
     (finding,) = describe_anomalies(session, found)
     return finding
 

@@ -64,11 +64,9 @@ def test_the_evidence_of_one_parameter_is_its_integral(true, scale, reference):
     rng = np.random.default_rng(3)
     jacobian, sigma = rng.normal(size=(7, 1)), 0.8
     readings = true * jacobian[:, 0] + sigma * rng.normal(size=7)
-    likelihood, errors, sizes = build_likelihood(jacobian, sigma=sigma, dof=7, stated=True)
+    likelihood = build_likelihood(jacobian, sigma=sigma, dof=7, stated=True)
     zero = np.zeros(7)
-    about = ModelLinearisation(
-        zero, jacobian, jacobian, likelihood, errors, sizes, np.zeros(1), zero
-    )
+    about = ModelLinearisation(zero, jacobian, jacobian, likelihood, np.zeros(1), zero)
     deviation, mean = readings - reference * jacobian[:, 0], np.array([reference])
     gain = about.log_positive_share(
         deviation, np.array([True]), mean, tolerance_scale=scale, noise_scale=1.0

@@ -71,7 +71,7 @@ def test_offsets_to_enter_have_the_least_tool_error(quarter):
     identified = np.array([e.identified for e in find_entries(result)])
     assert tool_error(quarter, result.errors, identified, space) > 1.2 * least
     # the gain by a difference; it holds for the active offsets, some mm away
-    gain = choose_offsets(tool, best, drives=range(3)).gain
+    _, gain = choose_offsets(tool, best, drives=range(3))
     name, step = "x_slide.ry", 1e-5
     parameters = tuple(
         replace(p, value=p.value + step) if p.name == name else p for p in result.parameters

@@ -64,7 +64,7 @@ def count_mistakes(example: str, sessions: int, sizes: tuple[float, ...]) -> dic
             every = [e for a in found[:1] for e in (a.explanation, *a.alternatives)]
             named = [is_named(e, made) for e in every]
             placed = [frozenset(e.rows) == made.rows for e in told]
-            alone = bool(found) and not found[0].ambiguous
+            alone = bool(found) and not found[0].alternatives
             row = counts[name, size]
             row[0] += 1
             row[1] += bool(told)
@@ -147,7 +147,8 @@ def count_pairs(plan, pairs: int) -> dict[str, int]:
         can = own >= CLEAR_LOG_BAYES and own - other >= SIMILAR_LOG_BAYES
         kinds = {a.explanation.kind for a in found.found}
         told = frozenset(i for a in found.found for i in a.explanation.rows)
-        named = kinds == {"reversed sign"} and told == rows and not found.ambiguous
+        alone = not any(a.alternatives for a in found.found)
+        named = kinds == {"reversed sign"} and told == rows and alone
         counts["made"] += 1
         counts["can be named"] += can
         counts["named"] += can and named

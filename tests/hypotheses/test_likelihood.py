@@ -23,7 +23,7 @@ CONSTANT = N / 2.0 * np.log(2.0 * np.pi)
 def case():
     rng = np.random.default_rng(4)
     jacobian = rng.normal(size=(N, ERRORS))
-    likelihood, _, _ = build_likelihood(jacobian, sigma=SIGMA, dof=N, stated=True)
+    likelihood = build_likelihood(jacobian, sigma=SIGMA, dof=N, stated=True)
     return jacobian, likelihood, rng.normal(size=(5, N)), rng.normal(size=(5, N))
 
 
@@ -60,10 +60,10 @@ def test_prior_weights_add_up_to_one(case):
 def test_principal_directions_reproduce_the_covariance(rows):
     """Wide and tall Jacobians are decomposed differently."""
     jacobian = np.random.default_rng(1).normal(size=(rows, ERRORS))
-    likelihood, errors, sizes = build_likelihood(jacobian, sigma=SIGMA, dof=rows, stated=True)
+    likelihood = build_likelihood(jacobian, sigma=SIGMA, dof=rows, stated=True)
     r = likelihood.directions
     assert r @ r.T == pytest.approx(np.eye(ERRORS), abs=1e-12)
-    assert (r.T * sizes) @ errors.T == pytest.approx(jacobian)
+    assert (r.T * likelihood.singular_values) @ likelihood.errors.T == pytest.approx(jacobian)
     assert (r.T * likelihood.variances) @ r == pytest.approx(jacobian @ jacobian.T)
 
 

@@ -30,8 +30,8 @@ def points(model, rng, *, unreachable=()):
     """Machines with errors of half their tolerances; the last two have machine shifts."""
     start, n = model.problem.active_passive, model.problem.n_free
     changes = [
-        MachineShift(model.entries_of(np.array([False, True])), rng.normal(size=n)),
-        MachineShift(model.entries_of(np.array([True, False])), 0.3 * rng.normal(size=n)),
+        MachineShift(model.session_of_entry == 1, rng.normal(size=n)),
+        MachineShift(model.session_of_entry == 0, 0.3 * rng.normal(size=n)),
     ]
     return [
         LinearisationPoint(

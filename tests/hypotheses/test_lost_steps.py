@@ -9,7 +9,7 @@ from made_mistakes import sound_machine
 
 from orthocal import simulate_session
 from orthocal.assessment.judgement import judge_session
-from orthocal.hypotheses.families.lost_steps import MAX_SCORED, lost_steps
+from orthocal.hypotheses.families.sessions import MAX_SCORED, lost_steps
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.search import find_anomalies
@@ -70,7 +70,7 @@ def test_a_large_session_has_few_hypotheses_or_none(plan, monkeypatch):
     (family,) = lost_steps(LinearModel(session), Rows(session))
     assert family.count == 3 * 2 * 11
     assert family.count * len(session.readings) < MAX_SCORED
-    monkeypatch.setattr("orthocal.hypotheses.families.lost_steps.MAX_SCORED", 400)
+    monkeypatch.setattr("orthocal.hypotheses.families.sessions.MAX_SCORED", 400)
     (thinned,) = lost_steps(LinearModel(session), Rows(session))
     assert 0 < thinned.count < family.count / 2
     single, joined = plan.with_values(np.zeros(18)), session

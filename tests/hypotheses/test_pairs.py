@@ -16,7 +16,7 @@ N, ROWS, EDITS = 9, 20, 14
 @pytest.fixture(scope="module")
 def case():
     rng = np.random.default_rng(2)
-    likelihood, _, _ = build_likelihood(rng.normal(size=(N, 4)), sigma=0.3, dof=N, stated=True)
+    likelihood = build_likelihood(rng.normal(size=(N, 4)), sigma=0.3, dof=N, stated=True)
     changed_rows = np.zeros((ROWS, N), dtype=bool)
     changed_rows[np.arange(ROWS), np.arange(ROWS) % N] = True
     singles = Singles(

@@ -21,7 +21,7 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.errors import RobotError
-from orthocal.hypotheses.families.effects import find_effects, missing_effects
+from orthocal.hypotheses.families.effects import find_effects, linearise_effect, missing_effects
 from orthocal.hypotheses.likelihood import (
     AmountPrior,
     _integrate_amounts,
@@ -29,7 +29,6 @@ from orthocal.hypotheses.likelihood import (
     log_of_sum,
 )
 from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.hypotheses.search import CLEAR_EFFECT_LOG_BAYES, find_anomalies
 from orthocal.statistics.distributions import log_positive_share
 
@@ -55,7 +54,7 @@ def test_backlash_is_named_with_its_drive_amount_and_option(with_backlash):
     judgement = judge_session(with_backlash)
     (found,) = judgement.anomalies
     e = found.explanation
-    assert (e.kind, found.ambiguous) == ("backlash", False)
+    assert (e.kind, found.alternatives) == ("backlash", ())
     amounts = dict(zip(e.parameters, zip(e.amounts, e.stds, strict=True), strict=True))
     value, std = amounts["y_slide.backlash"]
     assert value == pytest.approx(50e-6, abs=3.0 * std)
@@ -139,7 +138,7 @@ def test_an_effect_of_another_package_is_named_by_its_description(slack):
     judgement = judge_session(session)
     (found,) = judgement.anomalies
     e = found.explanation
-    assert (e.kind, e.effect, found.ambiguous) == ("other effect", "slack", False)
+    assert (e.kind, e.effect, found.alternatives) == ("other effect", "slack", ())
     for name, amount, std in zip(e.parameters, e.amounts, e.stds, strict=True):
         assert amount == pytest.approx(LOOSE.get(name, 0.0), abs=3.0 * std)
     assert dict(zip(e.parameters, e.stds, strict=True))["x_slide.slack"] < 4e-6
@@ -214,7 +213,7 @@ def test_a_half_normal_amount_is_integrated_over():
     """One column, against quadrature at each pair of scales."""
     rng = np.random.default_rng(3)
     jacobian, column = rng.normal(size=(8, 3)), rng.normal(size=8)
-    likelihood, _, _ = build_likelihood(jacobian, sigma=1.0, dof=8, stated=True)
+    likelihood = build_likelihood(jacobian, sigma=1.0, dof=8, stated=True)
     prior = AmountPrior(np.array([1.5]), np.array([True]))
     for amount in (2.0, -1.0):
         deviation = amount * column + rng.normal(size=8)

@@ -6,12 +6,12 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import load_afresh
+from symbolic_robot import SymbolicRobot
 from tolerances import KINEMATICS
 
 from orthocal.kinematics.error_map import SymbolicErrorMap
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
-from orthocal.kinematics.symbolic import SymbolicRobot
 
 
 def _draw(robot, size, seed=1):

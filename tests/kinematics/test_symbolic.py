@@ -7,15 +7,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from derivatives import assert_derivative, central_differences
+from symbolic_robot import SymbolicRobot, erroneous_placements
 from tolerances import DERIVATIVE, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.effects.protocol import Placement
-from orthocal.kinematics.symbolic import (
-    SymbolicRobot,
-    SymbolicTree,
-    erroneous_placements,
-)
+from orthocal.kinematics.symbolic import SymbolicTree
 from orthocal.robot.frames import place_frames
 from orthocal.robot.urdf import load_urdf
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from orthocal.planning.candidates import AlignedParameter, CandidateSetup
-from orthocal.planning.information_gain import Pairs, PointGain, SetupGain
-from orthocal.planning.setup_stack import stack_setups
+from orthocal.planning.information_gain import Pairs, PointGain, SetupGain, stack_setups
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
 

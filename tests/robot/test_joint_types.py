@@ -8,11 +8,11 @@ import pinocchio as pin
 import pytest
 from derivatives import assert_derivative
 from linkages import FREE, chain, joint, make_robot, write_ball_platform, write_robot
+from symbolic_robot import SymbolicRobot
 from tolerances import KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import RobotError
-from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.robot.urdf import load_urdf
 
 YAML = "closed_loop: []\ntype: []\nname_mot: [j0]\n"

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import load_afresh
+from symbolic_robot import SymbolicRobot
 
 from orthocal.kinematics.robot_functions import RobotFunctions
-from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.robot import urdf
 from orthocal.robot.frames import Placement
 from orthocal.runtime import disk_cache as cache

@@ -42,22 +42,18 @@ def describe_setting(planned: PlannedAdjustment) -> str:
 
 def describe_gain(plan: AdjustmentPlan) -> list[str]:
     """Expected tool error before and after adjustments, and its lower limit."""
-    lines = []
+    expected = f"Expected tool error with the offsets alone: {tool_mm(plan.before.entered)} RMS."
     if plan.adjustments:
         these = "these" if plan.judgement == "worthwhile" else "the best"
-        lines.append(
+        expected = (
             f"Expected tool error with {these} adjustments and offsets: "
             f"{tool_mm(plan.after.entered)} RMS (offsets alone: {tool_mm(plan.before.entered)})."
         )
-    else:
-        lines.append(
-            f"Expected tool error with the offsets alone: {tool_mm(plan.before.entered)} RMS."
-        )
-    lines.append(
+    limit = (
         f"{describe_compensated(plan.before.compensated)} No adjustment reaches less, because of "
         "the uncertainty of this calibration."
     )
-    return lines
+    return [expected, limit]
 
 
 def describe_limits(plan: AdjustmentPlan) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from orthocal.assessment.wording import (
     joined,
+    lines_in_file,
     mm,
     name_offsets,
     named,
@@ -348,10 +349,9 @@ def _lines(session: Session, e: Explanation) -> str:
     It is empty if the lines are unknown, those of several files, or all.
     """
     rows = [session.readings[i] for i in e.rows]
-    lines = [r.line for r in rows if r.line is not None]
-    if not lines or len(lines) == len(session.readings) or len({r.file for r in rows}) > 1:
+    lines = lines_in_file(rows)
+    if not lines or len(rows) == len(session.readings):
         return ""
-    lines = sorted(set(lines))  # the three readings of a point have the same line
     file = "" if session.firmware is None else " of readings.csv"  # not lines of the log
     return f"{spans(lines, 'line')}{file}: "
 

@@ -25,13 +25,12 @@ def describe_recommendation(
         identified: The identified model, which may be another one.
     """
     evidence = recommendation.log_evidence_of(recommendation.model)
+    reason = "It is the complete model, and the readings support no smaller one strongly."
     if evidence > 0.0:
         reason = (
             "The readings support it strongly against the complete model: the other errors are "
             "too small to detect."
         )
-    else:
-        reason = "It is the complete model, and the readings support no smaller one strongly."
     numbers = {"log_evidence": evidence}
     if identified is not None and identified != recommendation.model:
         against = evidence - recommendation.log_evidence_of(identified)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from orthocal.assessment.wording import (
     joined,
+    lines_in_file,
     named,
     note,
     parameter_places,
@@ -97,8 +98,8 @@ def outstanding_error(parameter: Parameter, error: float) -> Finding:
 
 def _describe_suspected(places: Sequence[Place]) -> str:
     """Sentence about readings that are the likeliest to be wrong; "" without lines of one file."""
-    lines = sorted({p.line for p in places if p.line is not None})
-    if not lines or len({p.file for p in places}) > 1:
+    lines = lines_in_file(places)
+    if not lines:
         return ""
     return f"If a single reading is wrong, it is most likely in {spans(lines, 'line')}. "
 
@@ -365,11 +366,11 @@ def exchanged_sides(
     """Finding about setups whose readings show a backlash with the opposite sign.
 
     Args:
-        lines: Their lines with stated sides, if they are known.
+        lines: Their lines with stated sides, ascending, if they are known.
         setups: Their names.
         places: Places of their readings.
     """
-    where = f" ({spans(sorted(lines), 'line')})" if lines else ""
+    where = f" ({spans(lines, 'line')})" if lines else ""
     these = "this setup" if len(setups) == 1 else "these setups"
     return review(
         "sides exchanged",

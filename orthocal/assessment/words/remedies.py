@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined, named
+from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, joined, lines_in_file, named
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.effects.loading import with_effects
 from orthocal.hypotheses.anomaly import Explanation
@@ -95,10 +95,9 @@ def advise_repetition(session: Session, *explanations: Explanation) -> str:
         setups = {r.setup for r in rows}
         if 2 * len(concerned) > sum(r.setup in setups for r in session.readings):
             return f"{repeat}."
-        lines = sorted({r.line for r in rows if r.line is not None})
         name = quote_path(rows[0].file) if session.joined and rows[0].file else "readings.csv"
         omitted = "leave out what is wrong"
-        if lines and len({r.file for r in rows}) == 1:
+        if lines := lines_in_file(rows):
             omitted = f"delete {spans(lines, 'line')} of {name}"
         return f"{repeat}. Or {omitted}, and calibrate again."
     what = "it" if len(rows) == 1 else "these"

@@ -74,7 +74,7 @@ class UnmodelledErrors:
     eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
 
 
-@cached_per_robot(maxsize=8)
+@cached_per_robot
 def machine_errors(robot: Robot) -> tuple[str, ...]:
     """Names of all errors of a machine, in the robot's order.
 

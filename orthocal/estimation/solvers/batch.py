@@ -213,9 +213,8 @@ class _BatchTask:
         try:
             steps = np.linalg.solve(normal, gradient[..., None])
         except np.linalg.LinAlgError:
-            steps = (
-                np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True) @ gradient[..., None]
-            )
+            inverses = np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True)
+            steps = inverses @ gradient[..., None]
         result: Array = np.asarray(steps[..., 0])
         low, high = self.low - theta, self.high - theta
         at_bound: NDArray[np.int8] = np.zeros(theta.shape, dtype=np.int8)

@@ -43,28 +43,17 @@ class SparseSum:
         values = ca.vertcat(*self._values)
         keys = columns * self._shape[0] + rows  # order of compressed columns
         unique, position = np.unique(keys, return_inverse=True)
-        sparsity = ca.Sparsity(
-            *self._shape,
-            _column_starts(unique // self._shape[0], self._shape[1]),
-            (unique % self._shape[0]).tolist(),
-        )
+        counts = np.bincount(unique // self._shape[0], minlength=self._shape[1])
+        starts = np.concatenate([[0], np.cumsum(counts)])  # first nonzero of each column
+        sparsity = ca.Sparsity(*self._shape, starts.tolist(), (unique % self._shape[0]).tolist())
         if unique.size == keys.size:
-            order = np.empty(keys.size, dtype=np.int64)
-            order[position] = np.arange(keys.size)
-            nonzeros = values[order.tolist()]
+            nonzeros = values[np.argsort(position).tolist()]
         else:
             summing = ca.Sparsity(
                 unique.size, keys.size, list(range(keys.size + 1)), position.tolist()
             )
             nonzeros = ca.mtimes(ca.MX(ca.DM.ones(summing)), values)
         return ca.MX(sparsity, ca.densify(nonzeros))
-
-
-def _column_starts(columns: Indices, count: int) -> list[int]:
-    """First nonzero of each column, for the columns of all nonzeros in ascending order."""
-    starts = np.zeros(count + 1, dtype=np.int64)
-    np.cumsum(np.bincount(columns, minlength=count), out=starts[1:])
-    return [int(v) for v in starts]
 
 
 class ProgramFunctions:

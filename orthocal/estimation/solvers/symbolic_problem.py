@@ -16,10 +16,8 @@ import numpy as np
 from orthocal.arrays import Indices
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.kinematics.error_map import SymbolicErrorMap
-from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.observation.sensor_groups import SensorGroup
 from orthocal.robot.model import closure_row_units
-from orthocal.sensors.compiled import express_reading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,23 +104,15 @@ class SymbolicProblem:
         shared, scale = self.error_map, self.problem.passive_scale
         constants = ca.SX.sym("constants", group.constants.shape[1])
         nuisance = ca.SX.sym("nuisance", group.nuisance.shape[1])
-        command, passive = self.second
-        second_posture = [shared.actuated(command), passive * scale]
-        h, h_a, h_q, h_t, h_r, h_nu, *by_second = group.reading.expression(
-            shared.actuated(self.command),
-            self.passive * scale,
-            shared.placements,
-            shared.actuated(self.reference),
-            constants,
-            nuisance,
-            *(second_posture if group.reading.pairs else []),
+        h, h_a, h_q, h_t, h_r, h_nu, *by_second = self._evaluate(
+            group, shared.placements, constants, nuisance
         )
         by_theta = shared.chain(h_t, h_a, self.command)
         by_theta += shared.chain(ca.SX(*h_t.shape), h_r, self.reference)
         h_q2 = ca.SX(1, 0)
         if by_second:
             h_a2, h_q2 = by_second
-            by_theta += shared.chain(ca.SX(*h_t.shape), h_a2, command)
+            by_theta += shared.chain(ca.SX(*h_t.shape), h_a2, self.second[0])
         by_theta, by_q = ca.sparsify(by_theta), [ca.sparsify(h_q), ca.sparsify(h_q2)]
         theta_index, indices = _used_columns(by_theta), [_used_columns(row) for row in by_q]
         by_passive = ca.horzcat(
@@ -153,42 +143,35 @@ class SymbolicProblem:
     # ---- direct expressions of θ̂ and q̂, for second derivatives
 
     @cached_property
+    def _direct_placements(self) -> ca.SX:
+        """Moved placements in a posture, shape (12 n_moved,)."""
+        return self.error_map.direct_placements(self.command)
+
+    @cached_property
     def direct_closure(self) -> ca.SX:
         """ĝ of one posture, shape (closure_rows,)."""
-        return self._machines[0].closure_residual() * self._row_scale
+        g, _, _, _ = self.problem.functions.closure_expressions(
+            self.error_map.actuated(self.command),
+            self.passive * self.problem.passive_scale,
+            self._direct_placements,
+        )
+        return self._row_scale * g
 
     def direct_reading(self, expressions: ReadingExpressions) -> ca.SX:
         """Reading h, [m]."""
-        robot, setups = self.problem.robot, list(self.problem.session.setups.values())
-        sensor = setups[int(expressions.group.setups[0])].sensor
-        frames = sensor.frames(robot)
-        kinds = frames.in_posture, frames.at_zero, frames.in_second
-        poses, at_zero, second = (
-            [machine.frame_pose(f) for f in names]
-            for machine, names in zip(self._machines, kinds, strict=True)
-        )
         constants, nuisance = expressions.constants, expressions.nuisance
-        return express_reading(robot, sensor, poses, at_zero, constants, nuisance, second=second)
+        return self._evaluate(expressions.group, self._direct_placements, constants, nuisance)[0]
 
-    @cached_property
-    def _machines(self) -> tuple[SymbolicRobot, SymbolicRobot, SymbolicRobot]:
-        """Machine in a posture, in the reference posture and in a second posture."""
-        problem, robot, n = self.problem, self.problem.robot, len(self.problem.robot.drives)
-        errors: dict[str, ca.SX | float] = dict(problem.fixed)
-        names = problem.machine_selection.names
-        errors.update({k: self.theta[i] * problem.theta_scale[i] for i, k in enumerate(names)})
-
-        def machine(command: ca.SX, passive: ca.SX) -> SymbolicRobot:
-            conditions = problem.functions.errors.split(command[n:])
-            return SymbolicRobot(
-                robot, drives=command[:n], passive=passive, errors=errors, conditions=conditions
-            )
-
-        return (
-            machine(self.command, self.passive * problem.passive_scale),
-            machine(self.reference, ca.SX(robot.reference_passive)),
-            machine(self.second[0], self.second[1] * problem.passive_scale),
-        )
+    def _evaluate(
+        self, group: SensorGroup, placements: ca.SX, constants: ca.SX, nuisance: ca.SX
+    ) -> list[ca.SX]:
+        """Reading of a sensor group and its derivatives (see `CompiledReading.expression`)."""
+        actuated, scale = self.error_map.actuated, self.problem.passive_scale
+        command, passive = self.second
+        inputs = [actuated(self.command), self.passive * scale, placements]
+        inputs += [actuated(self.reference), constants, nuisance]
+        inputs += [actuated(command), passive * scale] if group.reading.pairs else []
+        return group.reading.expression.call(inputs)
 
 
 def _used_columns(row: ca.SX) -> Indices:

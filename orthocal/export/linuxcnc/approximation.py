@@ -249,7 +249,7 @@ def approximate(
     middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     n = middle.size
     max_degree = MAX_DEGREE[n]
-    nodes = grid_points(chebyshev_line(max_degree + EXTRA_NODES), n)
+    nodes = grid_points(*[chebyshev_line(max_degree + EXTRA_NODES)] * n)
     checks = middle + half * check_points(n)
     with _reached(box):
         states = _reach_states(
@@ -413,7 +413,7 @@ def check_points(n: int, *, count: int = CHECKS, seed: int = 1) -> Array:
 
 def corners(n: int) -> Array:
     """Corners of a cube of ±1, shape (2^n, n)."""
-    return grid_points(np.array([-1.0, 1.0]), n)
+    return grid_points(*[[-1.0, 1.0]] * n)
 
 
 def _find_box(calibration: Calibration, half_side: float | None) -> Array:

@@ -7,17 +7,21 @@ square that was turned over without a statement is such a case: its error change
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.anomaly import Explanation, Scope
 from orthocal.hypotheses.hypothesis import Family, Rows
-from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.row_changes import dimension_changes, nuisance_columns
+from orthocal.hypotheses.linear_model import CACHE_SIZE, LinearModel
+from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
-from orthocal.session.session import Session, split_label
+from orthocal.sensors.protocol import DIMENSION_STEP, stated_dimensions
+from orthocal.session.session import Session, Setup, split_label
 
 MIN_RELATIVE_CHANGE = 0.5
 """Smallest change of the readings by one prior std of a considered parameter, relative to the
@@ -33,10 +37,9 @@ def wrong_artefacts(model: LinearModel, rows: Rows) -> Iterator[Family]:
         model: The linearised model.
         rows: The rows.
     """
-    families = _displaced(model, rows), _other_dimensions(model, rows), _readjusted(model, rows)
-    for family in families:
-        if family is not None:
-            yield family
+    yield _displaced(model, rows)
+    yield _other_dimensions(model, rows)
+    yield _readjusted(model, rows)
 
 
 def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
@@ -60,7 +63,7 @@ def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
     return {artefact: setups for artefact, setups in shared.items() if len(setups) > 1}
 
 
-def _displaced(model: LinearModel, rows: Rows) -> Family | None:
+def _displaced(model: LinearModel, rows: Rows) -> Family:
     """An artefact displaced before a setup: all its parameters have new values from there on."""
     explanations, groups = [], []
     columns = nuisance_columns(model)
@@ -82,36 +85,26 @@ def _displaced(model: LinearModel, rows: Rows) -> Family | None:
                     Explanation("displaced artefact", "setups", concerned, setups, (artefact,))
                 )
                 groups.append(changes[visible] / sizes[visible, None])
-    return Family.of(explanations, groups=groups) if explanations else None
+    return Family.of(explanations, groups=groups)
 
 
-def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
+def _other_dimensions(model: LinearModel, rows: Rows) -> Family:
     """A wrong stated dimension in one setup, or in all setups that state it."""
-    explanations: list[Explanation] = []
-    shapes: list[Array] = []
-    for dimension, changes in dimension_changes(model).items():
-        for setups in _each_and_all(changes):
-            change = np.sum([changes[name] for name in setups], axis=0)
-            concerned = np.flatnonzero(change)
-            explanations.append(
-                Explanation(
-                    "wrong dimension",
-                    "setup" if len(setups) == 1 else "setups",
-                    tuple(concerned.tolist()),
-                    setups,
-                    dimension,
-                )
-            )
-            shapes.append(change[concerned])
-    return Family.with_effects(rows, explanations, shapes) if explanations else None
+    return _with_dimensions(
+        rows,
+        [
+            (Explanation("wrong dimension", "setups", (), setups, dimension), changes)
+            for dimension, changes in dimension_changes(model).items()
+            for setups in _each_and_all(changes)
+        ],
+    )
 
 
-def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
+def _readjusted(model: LinearModel, rows: Rows) -> Family:
     """A dimension that differs in several setups of a gauge from one session on."""
     session = rows.session
     label = dict(zip(session.setups, session.labels, strict=True))
-    explanations: list[Explanation] = []
-    shapes: list[Array] = []
+    explained = []
     for dimension, changes in dimension_changes(model).items():
         gauges: dict[str, list[str]] = {}
         for name in changes:
@@ -123,20 +116,81 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
                 setups = tuple(n for n in of_gauge if label[n] in later)
                 if not 1 < len(setups) < len(of_gauge):  # one setup: `_other_dimensions`
                     continue
-                change = np.sum([changes[name] for name in setups], axis=0)
-                concerned = np.flatnonzero(change)
-                explanations.append(
-                    Explanation(
-                        "readjusted dimension",
-                        "setups",
-                        tuple(concerned.tolist()),
-                        setups,
-                        (*dimension, later[0]),
-                        sessions=(later[0],),
-                    )
-                )
-                shapes.append(change[concerned])
-    return Family.with_effects(rows, explanations, shapes) if explanations else None
+                names, since = (*dimension, later[0]), (later[0],)
+                e = Explanation("readjusted dimension", "setups", (), setups, names, sessions=since)
+                explained.append((e, changes))
+    return _with_dimensions(rows, explained)
+
+
+def _with_dimensions(
+    rows: Rows, explained: Sequence[tuple[Explanation, Mapping[str, Array]]]
+) -> Family:
+    """Family of other dimensions.
+
+    Args:
+        rows: The rows.
+        explained: Explanations without rows, and the changes of the rows by each setup that states
+            the dimension.
+    """
+    explanations, shapes = [], []
+    for e, changes in explained:
+        change = np.sum([changes[name] for name in e.setups], axis=0)
+        concerned = np.flatnonzero(change)
+        scope: Scope = "setup" if len(e.setups) == 1 else "setups"
+        explanations.append(replace(e, scope=scope, rows=tuple(concerned.tolist())))
+        shapes.append(change[concerned])
+    return Family.with_effects(rows, explanations, shapes)
+
+
+@lru_cache(maxsize=CACHE_SIZE)
+def nuisance_columns(model: LinearModel) -> Array:
+    """Change of the rows by one prior std of each nuisance parameter, [m].
+
+    The shape is (n_nuisance, n_rows). The machine has no errors. Gauge zeros are not projected out.
+    """
+    problem = model.problem
+    passive = model.at_reference(keep_jacobian=False).passive
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta, passive)
+    columns = jacobian[:, problem.n_machine :] * problem.noise_ratio[:, None]
+    return problem.observations.rows(columns).T
+
+
+@lru_cache(maxsize=CACHE_SIZE)
+def dimension_changes(model: LinearModel) -> Mapping[tuple[str, str], Mapping[str, Array]]:
+    """Derivative of the rows with respect to each dimension that setups state.
+
+    The machine has no errors.
+
+    Returns:
+        Key of the dimension and its stated value, to setup, to the derivative, shape (n_rows,).
+    """
+    session, o = model.problem.session, model.problem.observations
+    setups = {r.setup: session.setups[r.setup] for r in session.readings}
+    enlarged: dict[str, Setup] = {}
+    dimensions: dict[str, tuple[str, str]] = {}
+    for name, setup in setups.items():
+        for key, sensor in stated_dimensions(setup.sensor).items():
+            enlarged[name] = replace(setup, sensor=sensor)
+            dimensions[name] = key, _stated_value(setup.sensor.to_keys(), key)
+    if not enlarged:
+        return {}
+    other = replace(session, setups={**session.setups, **enlarged})
+    passive = model.at_reference(keep_jacobian=False).passive
+    stated, changed = (
+        o.rows(predict_readings(s, observations=o, passive=passive)) for s in (session, other)
+    )
+    change = (changed - stated) / DIMENSION_STEP
+    changes: dict[tuple[str, str], dict[str, Array]] = {}
+    for name, dimension in dimensions.items():
+        of_setup = [r.setup == name for r in session.readings]
+        changes.setdefault(dimension, {})[name] = np.where(of_setup, change, 0.0)
+    return changes
+
+
+def _stated_value(keys: Mapping[str, Any], key: str) -> str:
+    """Value of a key of a setup such as artefact.height_mm, as text."""
+    first, _, others = key.partition(".")
+    return _stated_value(keys[first], others) if others else f"{keys[first]:g}"
 
 
 def _each_and_all(changes: Mapping[str, Array]) -> list[tuple[str, ...]]:

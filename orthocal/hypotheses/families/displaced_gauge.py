@@ -26,23 +26,20 @@ MAX_STUCK = 16
 
 def displaced_gauges(rows: Rows) -> Iterator[Family]:
     """Gauges displaced within a setup or for one cycle, stuck dials."""
-    for family in (_displaced(rows), _cycle_apart(rows), _stuck(rows)):
-        if family is not None:
-            yield family
+    yield _displaced(rows)
+    yield _cycle_apart(rows)
+    yield _stuck(rows)
 
 
-def _displaced(rows: Rows) -> Family | None:
+def _displaced(rows: Rows) -> Family:
     """A gauge displaced within a setup: all later rows change by the same amount."""
     segments = [
         (indices, np.ones(indices.size))
         for indices in rows.setups.values()
         if rows.single[indices].all() and indices.size >= MIN_READINGS
     ]
-    if not segments:
-        return None
-    starts = [np.arange(2, indices.size - 1) for indices, _ in segments]
-    segment = np.repeat(np.arange(len(segments)), [s.size for s in starts])
-    start = np.concatenate(starts)
+    places = [(s, k) for s, (i, _) in enumerate(segments) for k in range(2, i.size - 1)]
+    segment, start = np.array(places, dtype=np.int64).reshape(-1, 2).T
 
     def explain(h: int) -> Explanation:
         indices = segments[segment[h]][0]
@@ -55,7 +52,7 @@ def _displaced(rows: Rows) -> Family | None:
     return Family(explain, start.size, start.size, effects=effects)
 
 
-def _cycle_apart(rows: Rows) -> Family | None:
+def _cycle_apart(rows: Rows) -> Family:
     """A gauge displaced for one inner cycle; at the first and last cycle `_displaced` applies."""
     explanations = []
     for (name, cycle), indices in rows.cycles.items():
@@ -66,10 +63,10 @@ def _cycle_apart(rows: Rows) -> Family | None:
             explanations.append(
                 Explanation("displaced gauge", "cycle", concerned, names=(name,), cycle=cycle)
             )
-    return Family.with_effects(rows, explanations) if explanations else None
+    return Family.with_effects(rows, explanations)
 
 
-def _stuck(rows: Rows) -> Family | None:
+def _stuck(rows: Rows) -> Family:
     """Runs of equal readings of different postures; all but the first carry no information."""
     runs: list[Indices] = []
     for indices in rows.setups.values():
@@ -82,15 +79,14 @@ def _stuck(rows: Rows) -> Family | None:
             run = indices[begins[k] : ends[k] + 1]
             if len({rows.session.readings[i].posture for i in run}) > 1:
                 runs.append(run)
-    if not runs:
-        return None
-    setups = [rows.session.readings[run[0]].setup for run in runs]
+    firsts = [int(run[0]) for run in runs]
     explanations = [
-        Explanation("stuck dial", "setup", tuple(run.tolist()), names=(setup,))
-        for run, setup in zip(runs, setups, strict=True)
+        Explanation(
+            "stuck dial", "setup", tuple(run.tolist()), names=(rows.session.readings[i].setup,)
+        )
+        for run, i in zip(runs, firsts, strict=True)
     ]
     silent = [run[1:] for run in runs]
-    firsts = [int(run[0]) for run in runs]
     steps = np.array([rows.gauge(i).resolution or rows.sigma(i) for i in firsts])
     volume = -np.log(steps) * [len(indices) for indices in silent]
     return Family.of(explanations, size=rows.count * MAX_STUCK, log_volume=volume, silent=silent)

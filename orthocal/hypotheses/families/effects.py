@@ -15,10 +15,11 @@ from orthocal.arrays import Indices
 from orthocal.effects.loading import measurable_effects, with_effects
 from orthocal.effects.registry import effect_names, find_effect, order_effects
 from orthocal.errors import RobotError
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import select_parameters
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, group_rows
 from orthocal.hypotheses.linear_model import CACHE_SIZE, LinearModel
-from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.observation.observations import readings_without
 from orthocal.session.session import Session
 
@@ -73,6 +74,38 @@ def find_effects(model: LinearModel) -> tuple[SystematicEffect, ...]:
     return tuple(effects)
 
 
+def linearise_effect(model: LinearModel, name: str) -> SystematicEffect:
+    """Linearised change of the rows by an effect that the robot's model lacks.
+
+    The point of linearisation is the nominal machine.
+
+    Args:
+        model: The linearised model.
+        name: Name of the effect.
+
+    Raises:
+        RobotError: If the effect needs keys that the robot's YAML lacks.
+    """
+    session, o = model.problem.session, model.problem.observations
+    robot = session.robot
+    other = session.with_effects((*robot.effect_names, name))
+    parameters = other.robot.parameters
+    errors = [n for n in parameters.names if n not in robot.parameters]
+    offsets = [model.problem.free[i] for i in model.offsets.values()]
+    selection = select_parameters(parameters, free=[*offsets, *errors], prior=True)
+    problem = CalibrationProblem(other, selection)
+    reading, jacobian = problem.predict_and_jacobian(problem.active_theta)
+    nominal = model.problem.predict(model.problem.active_theta) * model.problem.noise_ratio
+    present = set(model.problem.free) | set(offsets)
+    new = [i for i, n in enumerate(problem.free) if n not in present]
+    return SystematicEffect(
+        name,
+        tuple(problem.parameters[i] for i in new),
+        o.rows(reading - nominal),
+        o.rows(jacobian[:, new]).T,
+    )
+
+
 def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Iterator[Family]:
     """Effects with all their parameters, and drifts of single setups.
 
@@ -82,7 +115,7 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
     """
     for effect in effects:
         if effect.name == "drift":
-            yield from _drifts(rows, effect)
+            yield _drifts(rows, effect)
         concerned = np.flatnonzero(effect.change.astype(bool) | effect.columns.any(axis=0))
         setups = tuple(dict.fromkeys(rows.session.readings[i].setup for i in concerned))
         kind = EFFECT_KINDS.get(effect.name, "other effect")
@@ -90,7 +123,7 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
         yield Family.of([e], systematic=[effect])
 
 
-def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
+def _drifts(rows: Rows, effect: SystematicEffect) -> Family:
     """Drift of each setup by an unknown amount, and one common drift of all setups."""
     session, explanations, ramps = rows.session, [], []
     of_setup = group_rows(r.setup for r in session.readings)
@@ -107,5 +140,4 @@ def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
         names = tuple(e.setups[0] for e in explanations)
         explanations.append(Explanation("drift", "session", concerned, names))
         ramps.append(np.concatenate(ramps))
-    if explanations:
-        yield Family.with_effects(rows, explanations, ramps)
+    return Family.with_effects(rows, explanations, ramps)

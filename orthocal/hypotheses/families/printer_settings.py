@@ -20,10 +20,10 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
+from orthocal.hypotheses.families.artefacts import nuisance_columns
 from orthocal.hypotheses.families.sessions import divide_sessions
 from orthocal.hypotheses.hypothesis import Family, Patterns, sparse_rows
 from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.row_changes import nuisance_columns
 from orthocal.measurement.joining import settings_of_sessions
 from orthocal.observation.sensor_groups import fixed_parameters
 from orthocal.printers.settings import EQUAL, DeltaSettings
@@ -50,11 +50,11 @@ in `_to_vector`."""
 def changes_between_logs(model: LinearModel) -> Iterator[Family]:
     """Changes between the logs of a printer: of its active settings, or of its bed."""
     if len(model.labels) > 1 and model.problem.session.firmware is not None:
-        yield from _wrong_settings(model)
-        yield from _moved_bed(model)
+        yield _wrong_settings(model)
+        yield _moved_bed(model)
 
 
-def _wrong_settings(model: LinearModel) -> Iterator[Family]:
+def _wrong_settings(model: LinearModel) -> Family:
     """Settings of an earlier log that were active in a later one, or interchanged settings."""
     session = model.problem.session
     settings_of = settings_of_sessions(session)
@@ -72,12 +72,11 @@ def _wrong_settings(model: LinearModel) -> Iterator[Family]:
                 rows.append(log.rows)
                 explanations.append(Explanation(kind, "session", names=names, sessions=(label,)))
         before = stated
-    if explanations:
-        edits = Patterns(sparse_rows(rows, changes, len(session.readings)))
-        yield Family.of(explanations, edits=edits)
+    edits = Patterns(sparse_rows(rows, changes, len(session.readings)))
+    return Family.of(explanations, edits=edits)
 
 
-def _moved_bed(model: LinearModel) -> Iterator[Family]:
+def _moved_bed(model: LinearModel) -> Family:
     """A bed with another tilt and form from a log on."""
     session = model.problem.session
     names, of_printer = model.problem.free[model.problem.n_machine :], fixed_parameters(session)
@@ -93,8 +92,7 @@ def _moved_bed(model: LinearModel) -> Iterator[Family]:
         if shared.any() and not apart:
             explanations.append(Explanation("bed moved", "session", sessions=labels[:1]))
             groups.append(np.where(later, columns, 0.0)[shared] / sizes[0][shared, None])
-    if explanations:
-        yield Family.of(explanations, groups=groups)
+    return Family.of(explanations, groups=groups)
 
 
 def enter_settings_wrongly(before: DeltaSettings, stated: DeltaSettings) -> Iterator[Mistake]:

@@ -231,8 +231,6 @@ def _row_offsets(
         if i.size >= MIN_ROWS and begins
         for missing in (True, False)
     ]
-    if not offsets:
-        return
     if not any(o.position.size for o in offsets):
         return
     sizes = [o.position.size for o in offsets]

@@ -1,4 +1,4 @@
-"""Numbers of the controller that differ from the stated ones, and changes between joined sessions.
+"""Wrong numbers of the controller, lost steps, and changes of the machine between joined sessions.
 
 If a session states the offsets or backlashes E but its controller has C, its machine appears to
 have errors that differ by E − C.
@@ -6,19 +6,31 @@ have errors that differ by E − C.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations, permutations
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
+from orthocal.estimation.problem import CalibrationProblem
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
-from orthocal.hypotheses.hypothesis import Family, MachineShift
+from orthocal.hypotheses.hypothesis import Family, MachineShift, Rows
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.session.session import Session
 
 MAX_DRIVES = 6
 """Most drives of a robot of which all subsets are considered."""
+
+MIN_READINGS = 4
+"""Fewest readings of a session before and after a loss of steps; wrong readings explain fewer."""
+
+LOG_PROBABILITY_OF_LOSS = -3.0
+"""Logarithm of the prior probability of lost steps relative to other families. Drives lose steps
+more rarely than a gauge is displaced, which looks the same in the last setup."""
+
+MAX_SCORED = 2_000_000
+"""Most readings of all hypotheses of lost steps together. In larger sessions fewer readings are
+considered."""
 
 MAX_DIVIDED = 5
 """Most sessions of which all divisions into two groups are considered, in any order."""
@@ -48,7 +60,7 @@ def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
 def _of_controller(
     model: LinearModel, parameter: str, stated: Array, enter: Enter
 ) -> Iterator[Family]:
-    """Numbers of a session that were entered wrongly, each mistake once; none without a mistake.
+    """Numbers of a session that were entered wrongly, each mistake once.
 
     Args:
         model: The linearised model.
@@ -75,11 +87,18 @@ def _of_controller(
                     sessions=tuple(filter(None, model.labels[k : k + 1])),
                 )
             )
-            direction = np.zeros(model.problem.n_free)
-            direction[place] = (stated[k] - active) / model.problem.theta_scale[place]
+            changes = dict(zip(place, stated[k] - active, strict=True))
+            direction = _direction(model.problem, changes)
             shifts.append(MachineShift(model.session_of_entry == k, direction))
-    if explanations:
-        yield Family.of(explanations, shifts=shifts)
+    yield Family.of(explanations, shifts=shifts)
+
+
+def _direction(problem: CalibrationProblem, changes: Mapping[int, float]) -> Array:
+    """Change of all free parameters, shape (n_free,), [prior std], from those of some, [SI]."""
+    direction = np.zeros(problem.n_free)
+    for i, change in changes.items():
+        direction[i] = change / problem.theta_scale[i]
+    return direction
 
 
 def enter_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
@@ -148,39 +167,26 @@ def _by_drives(stated: Array, mistakes: Sequence[tuple[AnomalyKind, Array]]) -> 
 
 def _changed(model: LinearModel) -> Iterator[Family]:
     """One parameter that changes between sessions by an unknown amount."""
-    problem = model.problem
-    parameters, drive_of = problem.robot.parameters, {v: k for k, v in model.offsets.items()}
+    problem, offsets = model.problem, {f"{drive}.offset": drive for drive in model.offsets}
     place = {name: i for i, name in enumerate(problem.free[: problem.n_machine])}
-    of_offsets: list[tuple[str, Array]] = []
-    of_others: list[tuple[str, Array]] = []
-    for name, i in place.items():
-        direction = np.zeros(problem.n_free)
-        direction[i] = 1.0 / problem.theta_scale[i]
-        (of_offsets if i in drive_of else of_others).append((name, direction))
-    for p in parameters:
+    changes = {name: {i: 1.0} for name, i in place.items()}
+    for p in problem.robot.parameters:
         if len(p.terms) > 1 and p.name not in place and all(t in place for t, _ in p.terms):
-            direction = np.zeros(problem.n_free)
-            for term, coefficient in p.terms:
-                direction[place[term]] = coefficient / problem.theta_scale[place[term]]
-            of_others.append((p.name, direction))
-    for directions in (of_offsets, of_others):
-        if directions:
-            yield _steps(model, directions, drive_of, place)
+            changes[p.name] = {place[term]: coefficient for term, coefficient in p.terms}
+    directions = {name: _direction(problem, change) for name, change in changes.items()}
+    yield _steps(model, {n: d for n, d in directions.items() if n in offsets}, offsets)
+    yield _steps(model, {n: d for n, d in directions.items() if n not in offsets}, {})
 
 
 def _steps(
-    model: LinearModel,
-    directions: list[tuple[str, Array]],
-    drive_of: dict[int, str],
-    place: dict[str, int],
+    model: LinearModel, directions: Mapping[str, Array], offsets: Mapping[str, str]
 ) -> Family:
     """Change in each direction for each division of the sessions.
 
     Args:
         model: The linearised model.
-        directions: Names of parameters and their changes, shape (n_free,), [prior std].
-        drive_of: Index of the offset of a drive among the free parameters, to the drive.
-        place: Name of a parameter to its index among the free parameters.
+        directions: Name of a parameter to its change, shape (n_free,), [prior std].
+        offsets: Name of an offset to its drive.
     """
     labels, active = model.labels, model.active
     explanations, shifts = [], []
@@ -189,8 +195,8 @@ def _steps(
         names = tuple(labels[k] for k in (later if apart else later[:1]))
         differences = np.abs(active[sessions][:, None] - active[~sessions]).max(axis=2)
         entered = bool(differences.min() > ROUNDING)
-        for name, direction in directions:
-            drive = drive_of.get(place.get(name, -1))
+        for name, direction in directions.items():
+            drive = offsets.get(name)
             explanations.append(
                 Explanation(
                     "offset of one drive" if entered and drive else "machine changed",
@@ -201,8 +207,58 @@ def _steps(
                     apart=apart,
                 )
             )
-            shifts.append(MachineShift(model.entries_of(sessions), direction))
+            shifts.append(MachineShift(sessions[model.session_of_entry], direction))
     return Family.of(explanations, shifts=shifts, known=False)
+
+
+def lost_steps(model: LinearModel, rows: Rows) -> Iterator[Family]:
+    """Loss of steps of a drive within a session; none if no offset is identified.
+
+    Large single sessions have none (see `LinearModel.has_shifts`).
+
+    Args:
+        model: The linearised model.
+        rows: The rows.
+    """
+    if not model.has_shifts:
+        return
+    problem, explanations, shifts = model.problem, [], []
+    plus, minus = problem.observations.plus, problem.observations.minus
+    session_of_row = model.session_of_entry[plus]
+    for drive, i in model.offsets.items():
+        direction = _direction(problem, {i: 1.0})
+        for k, label in enumerate(model.labels):
+            of_session = np.flatnonzero(session_of_row == k)
+            for first in _first_readings(of_session, len(model.offsets) * rows.count):
+                later = of_session[of_session >= first]
+                entries = np.zeros(problem.observations.size, dtype=np.bool_)
+                entries[plus[later]] = True
+                entries[minus[later][minus[later] >= 0]] = True
+                explanations.append(
+                    Explanation(
+                        "lost steps",
+                        "session",
+                        first=int(first),
+                        drives=(drive,),
+                        parameters=(problem.free[i],),
+                        sessions=tuple(filter(None, (label,))),
+                    )
+                )
+                shifts.append(MachineShift(entries, direction))
+    rarity = np.full(len(shifts), LOG_PROBABILITY_OF_LOSS)
+    yield Family.of(explanations, shifts=shifts, known=False, log_volume=rarity)
+
+
+def _first_readings(rows: Indices, size: int) -> Indices:
+    """First readings after a loss that are considered, evenly spaced in large sessions.
+
+    Args:
+        rows: Rows of the session, in the order of measuring.
+        size: Number of readings in the hypotheses of one place.
+    """
+    possible = rows[MIN_READINGS : rows.size - MIN_READINGS + 1]
+    step = max(1, -(-possible.size * size // MAX_SCORED))
+    return possible[::step]
 
 
 def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
@@ -252,9 +308,8 @@ def detectable_changes(session: Session) -> dict[str, float]:
     sessions = np.arange(len(model.labels))
     steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
     for drive, i in offsets.items():
-        direction = np.zeros(problem.n_free)
-        direction[i] = 1.0 / problem.theta_scale[i]
-        shifts = [MachineShift(model.entries_of(later), direction) for later in steps]
+        direction = _direction(problem, {i: 1.0})
+        shifts = [MachineShift(later[model.session_of_entry], direction) for later in steps]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
         _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
         changes[drive] = DETECTABLE_CHANGE * float(stds.max())

@@ -123,8 +123,7 @@ def _groups(rows: Rows) -> list[Explanation]:
     setup_names = tuple(rows.setups)
     explanations = [_reversed("session", np.arange(rows.count), setup_names)]
     for (scope, name), setups in rows.groups.items():
-        kind: Scope = "leg" if scope == "leg" else "gauge"
-        explanations.append(_reversed(kind, rows.of_setups(setups), setups, (name,)))
+        explanations.append(_reversed(scope, rows.of_setups(setups), setups, (name,)))
     if len(setup_names) > 1:
         explanations += [
             _reversed("setup", indices, (name,)) for name, indices in rows.setups.items()

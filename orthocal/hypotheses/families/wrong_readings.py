@@ -27,22 +27,17 @@ MAX_GROUPS = 100
 
 def wrong_readings(rows: Rows) -> Iterator[Family]:
     """Mistakes in one reading, or in one posture of a setup in all cycles."""
-    yield _outliers(rows, [np.array([i]) for i in range(rows.count)])
-    if written := [np.array([i]) for i in np.flatnonzero(rows.written)]:
-        yield _multiplied(rows, written, (-1.0,), "reversed sign")
-        yield _multiplied(rows, written, DECIMAL_POINTS, "decimal point")
-    if dials := [i for i in written if not rows.paired[i].any()]:
-        yield _misread(rows, dials)
+    single = [np.array([i]) for i in range(rows.count)]
+    yield _outliers(rows, single, "outlier")
+    yield from _miswritten(rows, single)
+    yield _misread(rows, [i for i in single if rows.written[i].all() and not rows.paired[i].any()])
     in_all_cycles = [
         indices
         for (setup, *_), indices in rows.repeated.items()
         if len(indices) > 1 and len(rows.setups[setup]) >= MIN_POSTURES * len(indices)
     ]
-    if in_all_cycles:
-        yield _outliers(rows, in_all_cycles)
-    if written := [i for i in in_all_cycles if rows.written[i].all()]:
-        yield _multiplied(rows, written, (-1.0,), "reversed sign")
-        yield _multiplied(rows, written, DECIMAL_POINTS, "decimal point")
+    yield _outliers(rows, in_all_cycles, "inconsistent posture")
+    yield from _miswritten(rows, in_all_cycles)
 
 
 def _explain(
@@ -60,16 +55,17 @@ def _explain(
     return Explanation(kind, scope, concerned, names=names, factor=factor, amount=amount)
 
 
-def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
-    kind: AnomalyKind = "outlier" if len(groups[0]) == 1 else "inconsistent posture"
+def _outliers(rows: Rows, groups: Sequence[Indices], kind: AnomalyKind) -> Family:
     return Family.with_effects(rows, [_explain(rows, indices, kind) for indices in groups])
 
 
-def _multiplied(
-    rows: Rows, groups: Sequence[Indices], factors: Sequence[float], kind: AnomalyKind
-) -> Family:
-    explanations = [_explain(rows, i, kind, factor=factor) for factor in factors for i in groups]
-    return factor_family(rows, explanations)
+def _miswritten(rows: Rows, groups: Sequence[Indices]) -> Iterator[Family]:
+    """Reversed signs and misplaced decimal points of groups of written readings."""
+    written = [i for i in groups if rows.written[i].all()]
+    signs = [_explain(rows, i, "reversed sign", factor=-1.0) for i in written]
+    yield factor_family(rows, signs)
+    points = [_explain(rows, i, "decimal point", factor=f) for f in DECIMAL_POINTS for i in written]
+    yield factor_family(rows, points)
 
 
 def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
@@ -84,15 +80,24 @@ def inconsistent_groups(rows: Rows) -> Iterator[Family]:
     These hypotheses have many free amounts. So any more specific hypothesis that fits has more
     evidence.
     """
-    for family in (_inconsistent_setups(rows), _inconsistent_postures(rows)):
-        if family is not None and 0 < family.count <= MAX_GROUPS:
-            yield family
+    if 2 < len(rows.setups) <= MAX_GROUPS:
+        yield _inconsistent_setups(rows)
+    by_label: dict[str, list[Indices]] = {}
+    for indices in rows.repeated.values():
+        by_label.setdefault(rows.posture(int(indices[0])), []).append(indices)
+    groups = {k: v for k, v in by_label.items() if 1 < len(v) <= MAX_AMOUNTS}
+    explanations = [
+        Explanation(
+            "inconsistent posture", "postures", tuple(np.concatenate(g).tolist()), names=(label,)
+        )
+        for label, g in groups.items()
+    ]
+    if len(by_label) > 2 and len(groups) <= MAX_GROUPS:
+        yield Family.of(explanations, groups=list(groups.values()))
 
 
-def _inconsistent_setups(rows: Rows) -> Family | None:
-    """Setups whose readings are wrong by independent amounts; None with fewer than 3 setups."""
-    if not 2 < len(rows.setups) <= MAX_GROUPS:
-        return None
+def _inconsistent_setups(rows: Rows) -> Family:
+    """Setups whose readings are wrong by independent amounts."""
     explanations, groups = [], []
     for name, indices in rows.setups.items():
         amounts = [r for (setup, *_), r in rows.repeated.items() if setup == name]
@@ -103,20 +108,3 @@ def _inconsistent_setups(rows: Rows) -> Family | None:
             explanations.append(Explanation("inconsistent setup", "setup", concerned, (name,)))
             groups.append(amounts)
     return Family.of(explanations, groups=groups)
-
-
-def _inconsistent_postures(rows: Rows) -> Family | None:
-    """Postures whose readings in all setups are wrong by independent amounts; None with few."""
-    by_label: dict[str, list[Indices]] = {}
-    for indices in rows.repeated.values():
-        by_label.setdefault(rows.posture(int(indices[0])), []).append(indices)
-    if len(by_label) < 3:
-        return None
-    groups = {k: v for k, v in by_label.items() if 1 < len(v) <= MAX_AMOUNTS}
-    explanations = [
-        Explanation(
-            "inconsistent posture", "postures", tuple(np.concatenate(g).tolist()), names=(label,)
-        )
-        for label, g in groups.items()
-    ]
-    return Family.of(explanations, groups=list(groups.values()))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -154,9 +154,10 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
     Returns:
         Nonzeros of each output, shape (count, nnz); None if the interpreter cannot be compiled.
     """
-    interpreter = compile_interpreter()
-    if interpreter is None:
+    compiled = compile_interpreter()
+    if compiled is None:
         return None
+    interpreter, _ = compiled
     arrays = [np.ascontiguousarray(a) for a in inputs]
     # per input: address, numbers per row, points per row
     layout = np.array(
@@ -184,8 +185,9 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
     return [result[:, a:b] for a, b in itertools.pairwise(program.output_starts.tolist())]
 
 
-class Interpreter:
-    """Compiled interpreter, whose machine code exists as long as the engine.
+@lru_cache(maxsize=1)
+def compile_interpreter() -> tuple[Callable[..., None], object] | None:
+    """Interpreter and the engine that holds its machine code; None if it cannot be compiled here.
 
     Its arguments are addresses of arrays, and numbers:
 
@@ -202,23 +204,10 @@ class Interpreter:
         n_out
         work       shape (n_work, LANES)
     """
-
-    def __init__(self, engine: object, address: int) -> None:
-        self._engine = engine
-        number, pointer = ctypes.c_int64, ctypes.c_void_p
-        kinds = (pointer, number, *(pointer,) * 4, number, number, pointer, number, pointer)
-        self._run = ctypes.CFUNCTYPE(None, *kinds)(address)
-
-    def __call__(self, *arguments: int) -> None:
-        """Execute a program."""
-        self._run(*arguments)
-
-
-@lru_cache(maxsize=1)
-def compile_interpreter() -> Interpreter | None:
-    """Compile the interpreter, once; None if that fails on this machine."""
     from llvmlite import binding
 
+    number, pointer = ctypes.c_int64, ctypes.c_void_p
+    kinds = (pointer, number, *(pointer,) * 4, number, number, pointer, number, pointer)
     try:
         library = ctypes.CDLL(None)  # symbols of this process, the C library among them
         for name in map(str.lower, _CALLED):
@@ -234,7 +223,7 @@ def compile_interpreter() -> Interpreter | None:
         module.verify()
         engine = binding.create_mcjit_compiler(module, target)
         engine.finalize_object()
-        return Interpreter(engine, engine.get_function_address("run"))
+        return ctypes.CFUNCTYPE(None, *kinds)(engine.get_function_address("run")), engine
     except (RuntimeError, AttributeError, TypeError, OSError):
         return None
 

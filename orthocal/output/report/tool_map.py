@@ -20,6 +20,7 @@ from orthocal.assessment.assess import changes_offsets
 from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
+from orthocal.kinematics.workspace import grid_points
 from orthocal.output.report.figure import Plot, open_figure
 from orthocal.output.text.layout import true_minus
 from orthocal.units import MM, UM
@@ -70,7 +71,7 @@ def _find_grid(points: Array) -> list[Array] | None:
     lines = [np.unique(column) for column in points.T]
     if len(lines) < 2 or any(line.size < 3 or line.size % 2 == 0 for line in lines):
         return None
-    grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
+    grid = grid_points(*lines)
     return lines if np.array_equal(grid, points) else None
 
 

@@ -16,9 +16,9 @@ from orthocal.errors import ClosureError, OrthocalError, SolverError
 from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
     SIX_ROWS,
+    invert_equation_8,
     leg_parallelism_matrix,
     linearise_problem,
-    solve_equation_8,
 )
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
@@ -118,7 +118,7 @@ def test_linearised_offsets_of_the_paper_are_those_of_equation_8():
     rows = {(r.setup, r.posture): r.value for r in session.readings}
     assert len(rows) == 6
     differences = [rows[name, f"{name[1]}_max"] for name in SIX_ROWS]
-    offsets = solve_equation_8(matrix, differences).offsets
+    offsets = invert_equation_8(matrix) @ differences
     assert LinearisedProgram(problem).solve(sigma=1e-5).theta == pytest.approx(offsets, abs=1e-8)
 
 
