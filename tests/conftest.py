@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -140,6 +141,15 @@ def marked_reports():
         yield
 
 
+@pytest.fixture(scope="module")
+def assessed_once():
+    """A calibration without an assessment, which several texts state, is assessed once."""
+    from orthocal.assessment import assess
+
+    with patch.object(assess, "assess", cache(assess.assess)):
+        yield
+
+
 @pytest.fixture
 def without_sensor_gains():
     """Plans and details without gains of usual sensors, which have tests of their own."""
@@ -168,7 +178,7 @@ def no_sensor_gains():
 @contextmanager
 def plans_of_few_candidates():
     """Plans of commands with few candidates and one start; tests/planning verify plans."""
-    from uncompared import few_machines, uncompared
+    from uncompared import few_balls, few_machines, uncompared
 
     from orthocal.planning import tool_candidates
 
@@ -179,7 +189,7 @@ def plans_of_few_candidates():
     with (
         patch.object(orthocal, "Equipment", lambda **stated: equipment(**stated | FEW)),
         patch.object(orthocal, "plan_readings", plan_readings),
-        patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:2]),
+        few_balls(2),
         patch.object(tool_candidates, "BED_POINTS", 5),
         uncompared(),
         few_machines(),

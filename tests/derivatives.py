@@ -33,3 +33,38 @@ def assert_derivative(
     assert np.all(np.isfinite(exact))
     scale = max(1.0, float(np.abs(numeric).max(initial=0.0)))
     assert np.abs(exact - numeric).max(initial=0.0) / scale < tolerance
+
+
+def assert_program_derivatives(
+    f: dict, x: np.ndarray, p: np.ndarray, *, weight: float, directions: int, seed: int
+) -> None:
+    """Compare gradient, Jacobian and Hessian of a nonlinear program with central differences.
+
+    Args:
+        f: Functions of the program, as Ipopt calls them.
+        x: Its variables.
+        p: Its parameters.
+        weight: Factor of the objective in the Lagrangian.
+        directions: Number of drawn directions along which the derivatives are compared.
+        seed: Of the directions and of the multipliers.
+    """
+    rng, zero = np.random.default_rng(seed), np.zeros(directions)
+    along = rng.normal(size=(x.size, directions))
+    along /= np.linalg.norm(along, axis=0)
+    multipliers = rng.normal(size=f["nlp"].size1_out(1))
+
+    def values(t):
+        return np.concatenate([v.full().ravel() for v in f["nlp"](x + along @ t, p)])
+
+    def gradients(t):
+        gradient, jacobian = (f[k](x + along @ t, p)[1].full() for k in ("grad_f", "jac_g"))
+        return np.vstack([gradient.reshape(1, -1), jacobian])
+
+    numeric = central_differences(values, zero, step=1e-4)
+    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
+    assert (np.abs(gradients(zero) @ along - numeric) / scale).max() < DERIVATIVE
+    upper = f["hess_lag"](x, p, weight, multipliers).full()
+    assert not np.tril(upper, -1).any()
+    hessian = upper + np.triu(upper, 1).T
+    weights = np.r_[weight, multipliers]
+    assert_derivative(hessian @ along, lambda t: weights @ gradients(t), zero, step=1e-4)

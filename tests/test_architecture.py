@@ -60,13 +60,16 @@ def stage(path):
 
 
 @cache
-def parsed(path):
-    return ast.parse(path.read_text())
+def kept_nodes(path):
+    """Imports, functions and calls in a module, wherever in it."""
+    kinds = ast.ImportFrom | ast.Import | ast.FunctionDef | ast.AsyncFunctionDef | ast.Call
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return [node for node in ast.walk(tree) if isinstance(node, kinds)]
 
 
 def imported(path):
     """Names of the modules of this package that a module imports, wherever in it."""
-    for node in ast.walk(parsed(path)):
+    for node in kept_nodes(path):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("orthocal"):
             yield node.module
         elif isinstance(node, ast.Import):
@@ -105,7 +108,7 @@ def test_nothing_prints_outside_the_edges():
         str(path.relative_to(ROOT))
         for path in MODULES
         if stage(path) not in ("cli", "output")
-        for node in ast.walk(parsed(path))
+        for node in kept_nodes(path)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id == "print"
@@ -117,9 +120,10 @@ def test_contributing_names_what_exists():
     """Python files, and names followed by a file, such as `NAME` (`file.py`)."""
     text = " ".join((ROOT / "CONTRIBUTING.md").read_text().split())
     paths = [p for folder in ("orthocal", "tests", "docs") for p in (ROOT / folder).rglob("*.py")]
+    code = {p.as_posix(): p.read_text() for p in paths}
 
     def find(file):
-        return [p for p in paths if p.as_posix().endswith(f"/{file}")]
+        return [text for path, text in code.items() if path.endswith(f"/{file}")]
 
     files = re.findall(r"`([\w/]+\.py)`", text)
     assert [file for file in files if not find(file)] == []
@@ -131,19 +135,18 @@ def test_contributing_names_what_exists():
         f"{name} in {file}"
         for names, file in mentions
         for name in re.findall(r"(\w+)`", names)
-        if not any(re.search(rf"\b{name}\b", p.read_text()) for p in find(file))
+        if not any(re.search(rf"\b{name}\b", found) for found in find(file))
     ]
     assert missing == []
-    code = "".join(p.read_text() for p in paths)
-    constants_and_classes = re.findall(r"`([A-Z]\w+)`", text)
-    assert [n for n in constants_and_classes if not re.search(rf"\b{n}\b", code)] == []
+    constants_and_classes = set(re.findall(r"`([A-Z]\w+)`", text))
+    assert constants_and_classes <= set(re.findall(r"\b[A-Z]\w+", "".join(code.values())))
 
 
 def test_functions_have_at_most_60_lines():
     longer = {
         f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"
         for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in kept_nodes(path)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         and node.end_lineno - node.lineno >= 60
     }
@@ -151,7 +154,7 @@ def test_functions_have_at_most_60_lines():
 
 
 def test_type_checkers_know_the_public_names():
-    stub = parsed(ROOT / "orthocal/__init__.pyi")
+    stub = ast.parse((ROOT / "orthocal/__init__.pyi").read_text())
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     assert {a.name: n.module for n in imports for a in n.names} == orthocal._MODULES
     assert all(a.name == a.asname for n in imports for a in n.names)  # names of the package

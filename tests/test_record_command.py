@@ -29,6 +29,7 @@ from orthocal.measurement.motion.guidance import guide
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.output.sheet.page import sheet_files
+from orthocal.output.text.recording import RecordingText
 from orthocal.robot.loading import packaged_robots
 from orthocal.units import MM
 
@@ -68,8 +69,9 @@ def run(monkeypatch):
 
 @pytest.fixture
 def unjudged(monkeypatch):
-    """Readings without predictions and warnings: half of the time of a dialogue."""
+    """Readings without predictions, warnings and motions: most of the time of a dialogue."""
     monkeypatch.setattr(recording.Dialogue, "_is_judged", False)
+    monkeypatch.setattr(RecordingText, "_lifting", lambda *_: "")
 
 
 @pytest.mark.parametrize(
@@ -177,7 +179,6 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
         assert words in text
 
 
-@pytest.mark.usefixtures("unjudged")
 def test_a_setup_names_the_motions_with_the_plunger_up_as_the_sheet_does(folder, run):
     plan = PLAN.replace("x_max: {tcp_mm: [60, 0, 0]}", "aside: {tcp_mm: [0, 12, 0]}")
     (folder / "session.yaml").write_text(plan)

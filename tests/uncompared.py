@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack, contextmanager
 from unittest.mock import patch
 
-from orthocal.planning import cost_curve, expected_error
+from orthocal.planning import cost_curve, expected_error, tool_candidates
 from orthocal.planning.plan_comparison import Comparison
 
 
@@ -23,4 +23,11 @@ def uncompared():
 def few_machines():
     """Expected errors of plans as means over two drawn machines."""
     with patch.object(expected_error, "N_MACHINES", 2):
+        yield
+
+
+@contextmanager
+def few_balls(count):
+    """Some of the positions of a fixed ball."""
+    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:count]):
         yield

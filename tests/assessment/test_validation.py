@@ -52,6 +52,8 @@ from orthocal.observation.observations import build_observations
 from orthocal.output.text.summary import result_json
 from orthocal.statistics.chance import BY_CHANCE
 
+pytestmark = pytest.mark.usefixtures("assessed_once")
+
 QUICK = {"solver": "variable-projection"}
 
 MACHINES = 25
@@ -476,12 +478,19 @@ def assert_nothing_new_to_enter(result):
         assert not any(f"{e.drive}  {e.enter * 1e3:+.3f}" in text for e in new.entries)
 
 
-def test_values_to_enter_after_a_backlash_that_was_not_entered():
+@pytest.fixture(scope="module")
+def with_backlash():
+    """Plan and errors of a machine with backlash, and its calibration."""
     plan = effect_plan("backlash", setups=FEW).with_controller(np.zeros(3))
     errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
     errors |= {f"{d.name}.offset": 0.2e-3 for d in plan.robot.drives}
     errors |= {f"{d.name}.backlash": 60e-6 for d in plan.robot.drives}
-    calibration = calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
+    session = simulate_session(plan, errors, seed=1).session
+    return plan, errors, calibrate(session, "full", **UNJUDGED)
+
+
+def test_values_to_enter_after_a_backlash_that_was_not_entered(with_backlash):
+    plan, errors, calibration = with_backlash
     session = measure_again(plan, calibration, errors, seed=2)
     session = replace(session, compensation=compensation_to_enter(calibration))
     result = validate_calibration(calibration, session)
@@ -497,11 +506,9 @@ def test_values_to_enter_after_a_backlash_that_was_not_entered():
     assert [f"{d.name} backlash" in text for d in plan.robot.drives] == [True] * 3
 
 
-def test_backlash_of_the_calibration_is_assumed_with_its_offsets():
+def test_backlash_of_the_calibration_is_assumed_with_its_offsets(with_backlash):
     """The controller has both. A session that states the offsets alone may lack the backlash."""
-    plan = effect_plan("backlash", setups=FEW).with_controller(np.zeros(3))
-    errors = {f"{d.name}.backlash": 40e-6 for d in plan.robot.drives} | {"x_slide.offset": 0.2e-3}
-    calibration = calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
+    plan, errors, calibration = with_backlash
     entered = plan.with_controller(entered_offsets(calibration))
     entered = replace(entered, compensation=compensation_to_enter(calibration))
     stated = replace(simulate_session(entered, errors, seed=2).session, compensation=())

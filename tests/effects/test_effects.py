@@ -9,7 +9,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from derivatives import assert_derivative, central_differences
+from derivatives import assert_derivative, assert_program_derivatives
 from effect_plans import write_plan, write_robot
 from gauges import exact
 from slack import Slack
@@ -336,33 +336,9 @@ def test_the_tool_sensitivity_and_the_inverse_are_exact(plan):
 
 def test_the_program_has_exact_derivatives(problem):
     program = NonlinearProgram(problem, options=SolverOptions(hessian="exact"))
-    f, theta = program.functions(), point(problem)
-    x, p = program.initial_variables(theta, sigma=1e-4), program.parameter_values(sigma=1e-4)
-    rng = np.random.default_rng(4)
-    along = rng.normal(size=(x.size, 6))
-    along /= np.linalg.norm(along, axis=0)
-    lam = rng.normal(size=f["nlp"].size1_out(1))
-    gradient = np.asarray(f["grad_f"](x, p)[1]).ravel()
-    jacobian = np.asarray(f["jac_g"](x, p)[1].full())
-
-    def both(t):
-        objective, closure = f["nlp"](x + along @ t, p)
-        return np.r_[float(objective), np.asarray(closure).ravel()]
-
-    numeric = central_differences(both, np.zeros(6), step=1e-4)
-    found = np.vstack([gradient @ along, jacobian @ along])
-    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
-    assert (np.abs(found - numeric) / scale).max() < DERIVATIVE
-
-    def slope(t):
-        gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
-        return gradient + np.asarray(ca.mtimes(f["jac_g"](x + along @ t, p)[1].T, lam)).ravel()
-
-    upper = np.asarray(f["hess_lag"](x, p, 1.0, lam).full())
-    hessian = upper + np.triu(upper, 1).T
-    numeric = central_differences(slope, np.zeros(6), step=1e-4)
-    size = max(1.0, np.abs(numeric).max())
-    assert np.abs(hessian @ along - numeric).max() / size < DERIVATIVE
+    x = program.initial_variables(point(problem), sigma=1e-4)
+    p = program.parameter_values(sigma=1e-4)
+    assert_program_derivatives(program.functions(), x, p, weight=1.0, directions=6, seed=4)
 
 
 # ---- identification

@@ -62,6 +62,8 @@ times 1/(200 mm) beside a least eigenvalue of JᵀJ of 5e-3."""
 EXPRESSED = 2e-6
 """[m] A tower beside its direction is on a slightly larger radius, which three firmwares share."""
 
+pytestmark = pytest.mark.usefixtures("assessed_once")
+
 
 def make_printer(folder, seed, *, tilt=(0.002, -0.003)):
     """A printer with all errors of the complete model, and its robot as an import makes it."""

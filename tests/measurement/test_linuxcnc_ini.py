@@ -67,9 +67,6 @@ BACKLASH = 0.2
 HOMES = (352.5, 340.0, -3.25)
 """HOME_OFFSET of its joints, [mm]."""
 
-QUICK = ("--model", "offsets", "--along", "3", "--starts", "1", "--workers", "1")
-"""Options of a plan with a short search."""
-
 
 @pytest.fixture(scope="module", autouse=True)
 def without_pictures():
@@ -451,12 +448,13 @@ def test_offsets_are_not_entered_twice(folder, at_home, plain):
         assert not (folder / "twice").exists()
 
 
+@pytest.mark.usefixtures("quick_plans", "without_sensor_gains")
 def test_plans_keep_the_home_offsets_of_their_offsets(folder, at_home, plain):
     """Offsets that were entered since the session was measured would be entered twice."""
     write_session(restore_session(load_calibration(at_home)), folder / "first")
     (folder / "moved.ini").write_text(plain.read_text().replace("340", "340.5"))
     for out, words in (("plain", ["--ini", plain]), ("moved", ["--ini", "moved.ini"])):
-        done = run_orthocal(folder, "plan", "first", "--add", "1", "--out", out, *QUICK, *words)
+        done = run_orthocal(folder, "plan", "first", "--add", "1", "--out", out, *words)
         assert done.returncode == 0, done.stderr
         stated = home_positions(load_plan(folder / out).compensation)
         assert np.array(stated) / MM == pytest.approx(HOMES)

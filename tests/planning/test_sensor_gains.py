@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from unittest.mock import patch
 
 import pytest
 from calibrated import UNJUDGED
 from conftest import marked_plots
 from planned import QUICK, quick_plan
-from uncompared import uncompared
+from uncompared import few_balls, uncompared
 
 from orthocal import calibrate, plan_readings, simulate_session, summarize
 from orthocal.output.report import page
 from orthocal.planning import plan as planning
-from orthocal.planning import sensor_gains, tool_candidates
+from orthocal.planning import sensor_gains
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.sensor_gains import find_sensor_gains
@@ -29,9 +28,9 @@ length_tolerance_mm: unknown
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_balls():
+def quick():
     """Three positions of a fixed ball, in place of eleven; plans alone."""
-    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:3]), uncompared():
+    with few_balls(3), uncompared():
         yield
 
 

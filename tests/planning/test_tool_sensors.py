@@ -5,9 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from contextlib import contextmanager
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from commands import run_orthocal
 from machines import frame_pose, frames
 from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
-from uncompared import few_machines, uncompared
+from uncompared import few_balls, few_machines, uncompared
 
 from orthocal import (
     load_plan,
@@ -77,13 +75,6 @@ BLOCK = SQUARE.replace(
 PROBE = "sensor: probe\nsigma_mm: 0.01\n"
 TRACKER = "sensor: points\nsigma_mm: 0.01\ntarget_mm: [0, 0, -40]\n"
 CORRELATED = "covariance_um2: [[90, 40, 0], [40, 60, 0], [0, 0, 400]]\n"
-
-
-@contextmanager
-def few_balls(count):
-    """Some of the positions of a fixed ball."""
-    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:count]):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -360,14 +351,14 @@ def lowest(files):
     )
 
 
-@pytest.mark.parametrize("effects", [(), ("backlash",)])
-def test_a_bed_is_probed_from_above(owned, effects):
+def test_a_bed_is_probed_from_above(owned):
     """The operator probes from 10 mm above. The tool moves back before the next posture."""
-    robot = replace(with_effects(load_robot("linear_delta"), effects), legs={})
-    equipment = Equipment(owned=owned(probe=PROBE))
-    with uncompared(), few_machines():
-        session = plan_readings(robot, "offsets", hours=0.1, equipment=equipment, starts=1).session
-    assert {r.approach for r in session.readings} == {"nnn"}
+    equipment, about = Equipment(owned=owned(probe=PROBE)), {"hours": 0.1, "starts": 1}
+    for effects in ((), ("backlash",)):
+        robot = replace(with_effects(load_robot("linear_delta"), effects), legs={})
+        with uncompared(), few_machines():
+            session = plan_readings(robot, "offsets", equipment=equipment, **about).session
+        assert {r.approach for r in session.readings} == {"nnn"}
     files = sheet_files(session, options=ProgramOptions(dwell=1.0))
     assert "begin 10 mm before the surface" in files["sheet.html"]
     assert "Move to the" not in files["sheet.html"]
@@ -392,16 +383,16 @@ def lowered(robot, posture):
     return placed
 
 
-@pytest.mark.parametrize("box", [None, np.array([[-0.06, 0.06]] * 3)])
-def test_plans_of_a_machine_with_a_bed_stay_above_it(owned, box):
+def test_plans_of_a_machine_with_a_bed_stay_above_it(owned):
     """Postures, approaches and paths of gauges at the rods and of a ball bar."""
     robot = with_effects(load_robot("linear_delta"), ("backlash",))
-    equipment = Equipment(owned=owned(bar=BAR), box=box, along=4, sections=(0.5,))
-    listed = list_candidates(robot, equipment)
-    of_rods = {r.posture for r in listed.readings if r.setup[0] != "b"}
-    at_bed = {n for n, p in listed.postures.items() if p.values[2] == 0.0}
-    assert min(p.values[2] for p in listed.postures.values()) == 0.0
-    assert {r.approach for r in listed.readings if r.posture in at_bed & of_rods} == {"nnn"}
+    for box in (None, np.array([[-0.06, 0.06]] * 3)):  # the plan is for the box that the bed cuts
+        equipment = Equipment(owned=owned(bar=BAR), box=box, along=4, sections=(0.5,))
+        listed = list_candidates(robot, equipment)
+        of_rods = {r.posture for r in listed.readings if r.setup[0] != "b"}
+        at_bed = {n for n, p in listed.postures.items() if p.values[2] == 0.0}
+        assert min(p.values[2] for p in listed.postures.values()) == 0.0
+        assert {r.approach for r in listed.readings if r.posture in at_bed & of_rods} == {"nnn"}
     with few_balls(1), uncompared(), few_machines():
         plan = plan_readings(robot, "offsets", hours=1.0, equipment=equipment, starts=1).session
     assert {s.gauge for s in plan.setups.values()} == {"dial", "bar"}

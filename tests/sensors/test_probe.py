@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import simulated_printer
 from calibrated import identified
 from intervals import assert_coverage, recorded_scores
 from machines import frame_pose
@@ -85,11 +86,7 @@ def bed(folder, printer, postures, *, surface="plane", keys="", readings=None):
 
 def rings():
     """41 points on the bed."""
-    points = [(0.0, 0.0)]
-    for radius, count in ((22, 6), (44, 10), (64, 12), (80, 12)):
-        angles = 2.0 * np.pi * np.arange(count) / count + 0.1 * radius
-        points += [(radius * np.cos(a), radius * np.sin(a)) for a in angles]
-    return [f"{{tcp_mm: [{x:.3f}, {y:.3f}, 0]}}" for x, y in points]
+    return [f"{{tcp_mm: [{x:.3f}, {y:.3f}, 0]}}" for x, y in simulated_printer.rings()]
 
 
 def test_readings_are_heights_of_the_tip_above_the_surface(tmp_path, printer):

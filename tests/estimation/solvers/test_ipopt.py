@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from derivatives import central_differences
+from derivatives import assert_program_derivatives
 from gauges import exact
 from models import TRUTH
 from scipy.optimize import least_squares
@@ -42,59 +42,12 @@ def point(program, problem, size, seed=0):
     return x, program.parameter_values(sigma=2e-4, excluded=[1, 4])
 
 
-@pytest.mark.parametrize(
-    ("model", "loss", "size"),
-    [
-        ("offsets", HUBER, 1.5),
-        ("full", SQUARES, 1.5),
-    ],
-    ids=str,
-)
-def test_gradient_and_jacobian_are_exact(perfect, model, loss, size):
-    problem = build_problem(perfect, model=model, prior=True)
-    program = NonlinearProgram(problem, options=SolverOptions(loss=loss))
-    f = program.functions()
-    x, p = point(program, problem, size)
-    gradient = np.asarray(f["grad_f"](x, p)[1]).ravel()
-    jacobian = np.asarray(f["jac_g"](x, p)[1].full())
-    along = np.random.default_rng(1).normal(size=(x.size, 12))
-    along /= np.linalg.norm(along, axis=0)
-
-    def both(t):
-        objective, closure = f["nlp"](x + along @ t, p)
-        return np.r_[float(objective), np.asarray(closure).ravel()]
-
-    numeric = central_differences(both, np.zeros(12), step=1e-4)
-    exact = np.vstack([gradient @ along, jacobian @ along])
-    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
-    assert (np.abs(exact - numeric) / scale).max() < DERIVATIVE
-
-
-@pytest.mark.parametrize(
-    ("model", "loss", "size"),
-    [("offsets", HUBER, 1.5), ("full", SQUARES, 1.5)],
-    ids=str,
-)
-def test_the_exact_hessian_is_that_of_the_lagrangian(perfect, model, loss, size):
+@pytest.mark.parametrize(("model", "loss"), [("offsets", HUBER), ("full", SQUARES)], ids=str)
+def test_derivatives_of_the_program_are_exact(perfect, model, loss):
     problem = build_problem(perfect, model=model, prior=True)
     program = NonlinearProgram(problem, options=SolverOptions(hessian="exact", loss=loss))
-    f = program.functions()
-    x, p = point(program, problem, size)
-    lam_g = np.random.default_rng(2).normal(size=f["nlp"].size1_out(1))
-    upper = np.asarray(f["hess_lag"](x, p, 0.7, lam_g).full())
-    hessian = upper + np.triu(upper, 1).T
-    assert np.array_equal(np.tril(upper, -1), np.zeros_like(upper))
-    along = np.random.default_rng(3).normal(size=(x.size, 8))
-    along /= np.linalg.norm(along, axis=0)
-
-    def slope(t):
-        gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
-        jacobian = f["jac_g"](x + along @ t, p)[1]
-        return 0.7 * gradient + np.asarray(ca.mtimes(jacobian.T, lam_g)).ravel()
-
-    numeric = central_differences(slope, np.zeros(8), step=1e-4)
-    scale = max(1.0, np.abs(numeric).max())
-    assert np.abs(hessian @ along - numeric).max() / scale < DERIVATIVE
+    x, p = point(program, problem, 1.5)
+    assert_program_derivatives(program.functions(), x, p, weight=0.7, directions=12, seed=1)
 
 
 def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
