@@ -136,8 +136,8 @@ def tips(robot, errors, drives, tool):
 
 def correct(field, *text):
     """Corrected lines of a program."""
-    interpreter = Interpreter("p", axes=field.axes, offsets={})
-    corrector = ProgramCorrector(interpreter, field, within=WITHIN)
+    interpreter = Interpreter(axes=field.axes, offsets={})
+    corrector = ProgramCorrector(interpreter, field, file="p.ngc", within=WITHIN)
     return "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
 
 

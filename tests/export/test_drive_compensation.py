@@ -663,8 +663,8 @@ def run_corrected(calibration, field, *, backlash):
     """Tool of the calibrated machine along a corrected program, shape (K, 3), [mm]."""
     lags = find_lags(calibration.robot, calibration.errors)
     sides = ApproachSides(calibration, ACTIVE, lags) if backlash else None
-    interpreter = Interpreter("p", axes=field.axes, offsets={})
-    corrector = ProgramCorrector(interpreter, field, within=WITHIN, sides=sides)
+    interpreter = Interpreter(axes=field.axes, offsets={})
+    corrector = ProgramCorrector(interpreter, field, file="p.ngc", within=WITHIN, sides=sides)
     text = "".join(corrector.run(f"{line}\n" for line in PROGRAM))
     points = points_along(text.splitlines())
     motors = Machine(load_robot("orthoglide"), {}).inverse(points * MM) - ACTIVE
