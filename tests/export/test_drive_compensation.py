@@ -783,20 +783,13 @@ def test_motions_are_divided_where_a_drive_reverses():
         def command(self, points, sides):
             return points
 
-    arc = arc_about(
-        (10e-3, 0.0, 0.0),
-        (10e-3, 0.0, 0.0),
-        (0.0, 0.0),
-        plane=17,
-        clockwise=False,
-        turns=1,
-        where="",
-    )
+    at = (10e-3, 0.0, 0.0)
+    arc = arc_about(at, at, (0.0, 0.0), plane=17, clockwise=False, turns=1)
     paths = Paths.from_motions(
         [
-            Motion((0.0, 0.0, 0.0), (10e-3, 0.0, 0.0)),
-            Motion((10e-3, 0.0, 0.0), (10e-3, 0.0, 0.0), arc),
-            Motion((10e-3, 0.0, 0.0), (0.0, 0.0, 5e-3)),
+            Motion((0.0, 0.0, 0.0), at),
+            Motion(at, at, arc),
+            Motion(at, (0.0, 0.0, 5e-3)),
         ]
     )
     sides = Plain()
