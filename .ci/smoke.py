@@ -1,9 +1,9 @@
 """Smoke tests on other Pythons and other versions of what orthocal depends on.
 
 Runs `tests/test_smoke.py` and the symbolic kinematics in environments of their own: on the oldest
-and the newest Python of this machine that orthocal supports with the newest releases (except the
-Python that runs this file, on which the whole suite runs), and on the oldest with the lowest
-versions that pyproject.toml allows.
+and the newest Python of this machine that orthocal supports with the newest releases and the extra
+`fast` (except the Python that runs this file, on which the whole suite runs), and on the oldest
+with the lowest versions that pyproject.toml allows.
 
 Needs `uv`, which is installed into the environment of the Python that runs this file.
 """
@@ -59,7 +59,8 @@ def run_lane(python: Path, *, resolution: str) -> str:
         run([*uv, "venv", "--python", python, environment])
         install = [*uv, "pip", "install", "--python", inside, "--resolution", resolution]
         tools = ["pytest>=8.0", "pytest-timeout>=2.3"]
-        run([*install, "--editable", ROOT, *tools])
+        extra = "[fast]" if resolution == "highest" else ""
+        run([*install, "--editable", f"{ROOT}{extra}", *tools])
         cache = {**os.environ, "ORTHOCAL_CACHE": str(Path(directory) / "cache")}
         # beside the whole suite, with lower priority, a test may wait as long as the suite takes;
         # Python shows no user the deprecations within libraries
