@@ -198,8 +198,8 @@ def load_libraries() -> None:
     """Load what is loaded when first needed: SciPy, as for the peer, and LLVM where it is."""
     for name in ("scipy.linalg", "scipy.sparse"):
         import_module(name)
-    if llvm.is_installed():
-        llvm.compile_interpreter()
+    for lanes in llvm.LANES if llvm.is_installed() else ():
+        llvm.compile_interpreter(lanes)
 
 
 def measure(n_postures: int, solver: SolverKind = "ipopt") -> Timing:

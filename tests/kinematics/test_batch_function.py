@@ -32,7 +32,7 @@ def assert_same(found, expected):
 
 
 @pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
-@pytest.mark.parametrize("count", [0, 1, llvm.LANES - 1, llvm.LANES, 2 * llvm.LANES + 1])
+@pytest.mark.parametrize("count", [0, 1, *llvm.LANES, llvm.LANES[0] + 1, 2 * llvm.LANES[-1] + 1])
 def test_both_backends_give_the_same_numbers(request, name, count):
     robot = request.getfixturevalue(name)
     functions, where = robot_functions(robot), points(robot, count)
@@ -68,7 +68,7 @@ def test_inputs_of_other_shapes_are_refused(shapes, backend):
         batch(*map(np.ones, shapes), backend=backend)
 
 
-@pytest.mark.parametrize("count", [llvm.LANES - 3, 101])
+@pytest.mark.parametrize("count", [*(n - 3 for n in llvm.LANES), 101])
 def test_every_operation_is_casadis(count):
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     results = [
@@ -121,7 +121,7 @@ def test_the_backend_depends_on_the_call_alone(orthoglide, monkeypatch, installe
 def test_casadi_evaluates_where_the_interpreter_cannot_be_compiled(orthoglide, monkeypatch):
     function, where = robot_functions(orthoglide).closure_by_passive, points(orthoglide, 3)
     expected = function(*where, backend="casadi")
-    monkeypatch.setattr(llvm, "compile_interpreter", lambda: None)
+    monkeypatch.setattr(llvm, "compile_interpreter", lambda _: None)
     assert_same(function(*where, backend="llvm"), expected)
 
 

@@ -27,7 +27,7 @@ CALL_COST = 2000
 
 MIN_POINTS, MIN_OPERATIONS = 3, 2e3
 """Points, and points times instructions, from which a call uses the LLVM backend. It needs as long
-for 16 points as CasADi for two or three, and 0.03 s once to start."""
+for 8 points as CasADi for two, and for 32 points as for three. It starts once in 0.05 s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """LLVM backend, which executes CasADi functions for several points at once.
 
 A CasADi function of scalar expressions is a list of instructions. An interpreter in machine code,
-compiled by llvmlite for the present processor, executes each instruction for LANES points at once.
+compiled by llvmlite for the present processor, executes each instruction for several points at
+once.
 Its operations are those of CasADi's virtual machine, in the same order, correctly rounded or from
 the C library. The numbers are therefore the same, in about a tenth of the time.
 """
@@ -23,8 +24,9 @@ from numpy.typing import NDArray
 from orthocal.arrays import Array, Indices
 from orthocal.runtime import disk_cache
 
-LANES = 16
-"""Points for which one instruction is executed at once."""
+LANES = (8, 16, 32)
+"""Points for which an interpreter executes one instruction at once. Reading an instruction takes as
+long as executing it for some 16 points."""
 
 MIN_CACHED = 1000
 """Smallest number of instructions of a function whose program is cached on disk."""
@@ -154,7 +156,8 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
     Returns:
         Nonzeros of each output, shape (count, nnz); None if the interpreter cannot be compiled.
     """
-    compiled = compile_interpreter()
+    lanes = next((n for n in LANES if count <= n), LANES[-1])
+    compiled = compile_interpreter(lanes)
     if compiled is None:
         return None
     interpreter, _ = compiled
@@ -169,7 +172,7 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
         dtype=np.int64,
     )
     n_out = int(program.output_starts[-1])
-    result, work = np.empty((count, n_out)), np.empty((program.n_work, LANES))
+    result, work = np.empty((count, n_out)), np.empty((program.n_work, lanes))
     if count:
         interpreter(
             program.table.ctypes.data,
@@ -185,8 +188,8 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
     return [result[:, a:b] for a, b in itertools.pairwise(program.output_starts.tolist())]
 
 
-@lru_cache(maxsize=1)
-def compile_interpreter() -> tuple[Callable[..., None], object] | None:
+@lru_cache(maxsize=len(LANES))
+def compile_interpreter(lanes: int) -> tuple[Callable[..., None], object] | None:
     """Interpreter and the engine that holds its machine code; None if it cannot be compiled here.
 
     Its arguments are addresses of arrays, and numbers:
@@ -202,7 +205,10 @@ def compile_interpreter() -> tuple[Callable[..., None], object] | None:
         points     number of points
         outputs    shape (points, n_out)
         n_out
-        work       shape (n_work, LANES)
+        work       shape (n_work, lanes)
+
+    Args:
+        lanes: Points for which one instruction is executed at once.
     """
     from llvmlite import binding
 
@@ -219,7 +225,7 @@ def compile_interpreter() -> tuple[Callable[..., None], object] | None:
         target = binding.Target.from_default_triple().create_target_machine(
             cpu=binding.get_host_cpu_name(), features=features, opt=2
         )
-        module = binding.parse_assembly(_Source(LANES).text())
+        module = binding.parse_assembly(_Source(lanes).text())
         module.verify()
         engine = binding.create_mcjit_compiler(module, target)
         engine.finalize_object()
