@@ -216,7 +216,7 @@ def test_reports_of_reprapfirmware(probed):
         "Diagonals 280.000:280.400:279.700, delta radius 141.200, homed height 317.100, bed radius "
         "90.0, X 0.300°, Y -0.200°, Z 0.000°\n"
         "Endstop adjustments X0.10 Y-1.00 Z0.90, tilt X0.30% Y-0.20%\n"
-        "G31 X2 Y3 Z1.5\nG30 P0 X0 Y0 Z-9999\nG30 P2 X0 Y50 Z-9999\nG30 P1 X50 Y0 Z-9999 S-1\n"
+        "G31 X2 Y3 Z1.5\nG30 P0 X0 Y0 Z-9999\nG30 P2 X0 Y50 Z-9999\nG30P1X50Y0Z-9999S-1\n"
         "G32 bed probe heights: 0.100 0.200 0.300, mean 0.2, deviation from mean 0.1\n"
     )
     log = probed(text)

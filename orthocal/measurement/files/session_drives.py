@@ -60,7 +60,7 @@ def require_count(
 def build_compensation(
     keys: ControllerKeys, robot: Robot, *, folder: Path, where: str
 ) -> Compensation:
-    """What the controller compensates, and home positions of its joints; empty if not stated.
+    """Compensation by the controller, with the home positions of its joints; empty if not stated.
 
     Args:
         keys: Keys under `controller`.
