@@ -37,14 +37,12 @@ calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED)
-	@# two processes at first: a benchmark compares times
-	$(MAKE) --jobs 2 --output-sync check $(BESIDE) compiled
-	$(MAKE) suite
+	$(MAKE) --jobs 2 check suite
 
 compiled: $(TESTED)  # the tests, once for all workers
 	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
 
-suite: $(TESTED)
+suite: compiled $(BESIDE)  # the checks may still run; a benchmark runs beside them alone
 	$(PYTEST_IN_PARALLEL) -m "$(MARKS)"
 
 acceptance: $(TESTED)
