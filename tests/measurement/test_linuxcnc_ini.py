@@ -249,6 +249,9 @@ def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
     assert export(folder, one, "other", *other).returncode == 0
     lines = [(folder / name / "joints.ini").read_text() for name in ("file", "stated", "other")]
     assert lines[0] == lines[1] != lines[2]
+    for name, expected in (("file", (-1, 1, 1)), ("other", (1, 1, 1))):  # for the next commands
+        path = folder / name / "joints.ini"
+        assert read_controller_joints(path, load_calibration(one).robot).latched == expected
     twice = export(folder, one, "twice", "--ini", plain, "--latched", "+,+,+")
     assert twice.returncode == 2
     assert "--latched" in twice.stderr
@@ -470,7 +473,7 @@ def test_again_compares_home_offsets(folder, at_home, plain):
     lines = (folder / "home/joints.ini").read_text()
     (folder / "entered.ini").write_text(with_lines(plain.read_text(), lines))
     found = [float(v) for v in re.findall(r"(?m)^HOME_OFFSET = (\S+)", lines)]
-    for k, ini in enumerate(("entered.ini", "home/joints.ini")):  # the latter states no latching
+    for k, ini in enumerate(("entered.ini", "home/joints.ini")):  # the latter has a comment on it
         done = run_orthocal(folder, "again", at_home, "--out", f"second-{k}", "--ini", ini)
         assert done.returncode == 0
         assert f"The lines of {ini} contain them" in " ".join(done.stdout.split())

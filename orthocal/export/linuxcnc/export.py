@@ -160,7 +160,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     )
     return {
         "README.md": write_module_page(calibration, approximation, homes, stated=stated),
-        "kinematics.ini": write_module_lines(approximation, homes),
+        "kinematics.ini": write_module_lines(approximation, homes, stated=stated),
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
         **tables,

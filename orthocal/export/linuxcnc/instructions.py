@@ -54,6 +54,7 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
             "# With these lines a session states the offsets of the drives:",
             f"# {_describe_offsets(calibration)}",
         ]
+    lines += _latching_lines(homes, stated=stated)
     for i, home in enumerate(homes):
         lines += [
             "",
@@ -73,11 +74,26 @@ def _describe_offsets(calibration: Calibration) -> str:
     return f"controller: {{{drive_keys('offsets', calibration.robot.drives, offsets)}}}"
 
 
-def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
-    """INI lines for the kinematics module: limits of the axes, unchanged joints."""
+def _latching_lines(homes: Sequence[JointHome], *, stated: bool) -> list[str]:
+    """Comment with the signs of HOME_LATCH_VEL, which commands read from exported lines."""
+    signs = ", ".join("+" if h.compensation.latched > 0 else "-" for h in homes)
+    return [f"# signs of HOME_LATCH_VEL: [{signs}]"] if stated else []
+
+
+def write_module_lines(
+    approximation: Approximation, homes: Sequence[JointHome], *, stated: bool
+) -> str:
+    """INI lines for the kinematics module: limits of the axes, unchanged joints.
+
+    Args:
+        approximation: The machine of the module.
+        homes: The joints.
+        stated: Whether the directions in which homing latches the switches were stated.
+    """
     coordinates, inverse = approximation.coordinates, approximation.inverse
     lines = [
         "# Calibrated kinematics module. HOME_OFFSET remains that of the measurement.",
+        *_latching_lines(homes, stated=stated),
         "",
         "[KINS]",
         "KINEMATICS = orthocal_kins",

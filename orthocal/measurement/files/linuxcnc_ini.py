@@ -31,6 +31,9 @@ COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{(offsets_[^{}]*)\}\r?$")
 """Comment of exported lines with the offsets of the drives (`drive_keys`)."""
 
+EXPORTED_SIGNS = re.compile(r"(?m)^# signs of HOME_LATCH_VEL: \[([+-](?:, [+-])*)\]\r?$")
+"""Comment of exported lines with the directions in which homing latches the switches."""
+
 OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
 """Offsets of the drives with one unit in this comment."""
 
@@ -48,7 +51,8 @@ class ControllerJoints:
     limits: tuple[tuple[float, float], ...]
     """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
     latched: tuple[int, ...] | None
-    """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
+    """Sign of HOME_LATCH_VEL, 1 or -1; None if neither a joint nor the comment of exported lines
+    states one."""
     compensation: Compensation
     """BACKLASH, COMP_FILE and HOME_OFFSET of each joint. HOME_OFFSET is None if no joint states it
     or HOME_LATCH_VEL, as in a fragment that states changes only."""
@@ -96,7 +100,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     known = stated or any(home is not None for home in homes)
     return ControllerJoints(
         limits,
-        tuple(latch or 1 for latch in latched) if stated else None,
+        tuple(latch or 1 for latch in latched) if stated else _read_signs(text, robot.drives),
         with_homes(trims, [home or 0.0 for home in homes] if known else None),
         None if stated else _read_offsets(text, robot.drives),
         tuple(opposed),
@@ -121,6 +125,13 @@ def _require_unit(keys: Mapping[str, str], key: str, unit: str) -> None:
     stated = keys.get(key)
     if stated is not None and stated.casefold() not in UNIT_WORDS[unit]:
         raise ParameterError(f"{key} is {stated}; expected {unit}")
+
+
+def _read_signs(text: str, drives: Sequence[Drive]) -> tuple[int, ...] | None:
+    """Signs of HOME_LATCH_VEL that a comment of exported lines states; None without it."""
+    match = EXPORTED_SIGNS.search(text)
+    signs = () if match is None else tuple(1 if s == "+" else -1 for s in match[1].split(", "))
+    return signs if len(signs) == len(drives) else None
 
 
 def _read_offsets(text: str, drives: Sequence[Drive]) -> tuple[float, ...] | None:
