@@ -377,9 +377,9 @@ def test_a_bed_is_probed_from_above(owned):
         plan_motion(replace(session, readings=(stated, *session.readings[1:])))
 
 
-def lowered(robot, posture):
-    """Posture 1 mm below another one."""
-    (placed,) = place_tool(robot, [posture.name], posture.values[None] - [0.0, 0.0, 1e-3]).values()
+def lowered(robot, posture, depth=1e-3):
+    """Posture below another one by a depth, [m]."""
+    (placed,) = place_tool(robot, [posture.name], posture.values[None] - [0.0, 0.0, depth]).values()
     return placed
 
 
@@ -397,10 +397,10 @@ def test_plans_of_a_machine_with_a_bed_stay_above_it(owned):
         plan = plan_readings(robot, "offsets", hours=1.0, equipment=equipment, starts=1).session
     assert {s.gauge for s in plan.setups.values()} == {"dial", "bar"}
     assert lowest(sheet_files(plan)) >= 0.0
-    below = replace(plan, postures={n: lowered(robot, p) for n, p in plan.postures.items()})
-    if min(p.values[2] for p in below.postures.values()) < 0.0:
-        with pytest.raises((SessionError, UnreachablePathError), match="below the bed"):
-            plan_motion(below)
+    depth = 1e-3 + min(p.values[2] for p in plan.postures.values())
+    below = replace(plan, postures={n: lowered(robot, p, depth) for n, p in plan.postures.items()})
+    with pytest.raises((SessionError, UnreachablePathError), match="below the bed"):
+        plan_motion(below)
 
 
 def test_a_machine_without_a_bed_may_move_below_its_zero():
