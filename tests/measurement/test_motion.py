@@ -32,7 +32,7 @@ from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.effects.loading import with_effects
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError, UnreachablePathError
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.motion.approach import (
@@ -586,6 +586,33 @@ def test_a_ball_bar_keeps_its_length_between_its_readings(bar):
         assert [signs[k] for k in stop.approach] == np.where(known, np.sign(change), 0.0).tolist()
         assert np.linalg.norm(stop.approach_point - stop.point) == pytest.approx(0.5 * MM, rel=1e-4)
         assert stop.posture != before.posture
+
+
+OVER_BED = """robot: linear_delta
+gauge: {sigma_mm: 0.005, range_mm: [-1, 1]}
+postures:
+  a: {tcp_mm: [60, 0, 0]}
+  b: {tcp_mm: [0, 60, 0]}
+  below: {tcp_mm: [0, 0, 0]}
+setups:
+  bar: {sensor: ball_bar, centre_mm: [0, 0, 80], length_mm: 100}
+"""
+
+
+def test_a_bar_with_its_fixed_ball_above_moves_over_the_bed(tmp_path):
+    """Half way on a great arc it would be 8.3 mm below the bed."""
+    (tmp_path / "bar.yaml").write_text(OVER_BED)
+    plan = load_plan(tmp_path / "bar.yaml")
+    session = replace(plan, readings=(Reading("bar", "a"), Reading("bar", "b", cycle=2)))
+    (motion,) = plan_motion(session)
+    points, _ = read_program(write_program(session, motion), session.robot)
+    assert points[:, 2].min() > -ROUNDED
+    lengths = np.linalg.norm(points - [0.0, 0.0, 80.0], axis=1)
+    assert np.abs(lengths[-10:] - 100.0).max() < 0.005 + ROUNDED
+    # shorter below the fixed ball: then each path bulges through the bed
+    rows = (Reading("bar", "a"), Reading("bar", "below", cycle=2))
+    with pytest.raises(UnreachablePathError, match="posture 'below' .* goes below the bed"):
+        plan_motion(replace(session, readings=rows))
 
 
 def test_readings_of_a_bar_without_an_approach_get_that_of_their_path(bar):
