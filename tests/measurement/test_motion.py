@@ -611,7 +611,7 @@ def test_a_bar_with_its_fixed_ball_above_moves_over_the_bed(tmp_path):
     assert np.abs(lengths[-10:] - 100.0).max() < 0.005 + ROUNDED
     # shorter below the fixed ball: then each path bulges through the bed
     rows = (Reading("bar", "a"), Reading("bar", "below", cycle=2))
-    with pytest.raises(UnreachablePathError, match="posture 'below' .* goes below the bed"):
+    with pytest.raises(UnreachablePathError, match=r"posture 'below' .* goes below the bed"):
         plan_motion(replace(session, readings=rows))
 
 
