@@ -25,9 +25,11 @@ from orthocal.assessment.plausibility import (
 from orthocal.assessment.repeated_readings import find_scattered
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import (
+    Correction,
     describe_anomalies,
     describe_no_change,
     describe_wrong_order,
+    describe_wrong_time,
     place_of,
 )
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
@@ -359,13 +361,16 @@ def _describe_order(session: Session) -> list[Finding]:
     last = model.labels[model.order[-1]]
     if last == model.labels[-1]:
         return []
-    times = model.times
-    later = bool(times) and times[last] > times[model.labels[-1]]
-    return [
-        describe_wrong_order(
-            model.labels[-1], last, timed=later, firmware=session.firmware is not None
-        )
-    ]
+    given, times = model.labels[-1], model.times
+    if times and times[last] > times[given]:
+        return [describe_wrong_time(given, last)]
+    corrections = dict(zip(model.labels, model.corrections, strict=True))
+    kind: Correction = (
+        "compensation" if corrections[given][0] == corrections[last][0] else "offsets"
+    )
+    if kind == "offsets" and session.firmware is not None:
+        kind = "settings"
+    return [describe_wrong_order(given, last, kind)]
 
 
 def _describe_detectable(session: Session) -> Finding:

@@ -203,15 +203,24 @@ class LinearModel:
         """Sessions in the order of measuring, shape (n_sessions,).
 
         The times of the readings determine the order if all readings state them. Without times, or
-        at equal times, sessions whose controller corrects nothing come first; all others have the
-        order in which they were joined. A printer corrects something by settings of single towers.
+        at equal times, sessions with `corrections` come later; all others have the order in which
+        they were joined.
+        """
+        times = self.times or dict.fromkeys(self.labels, datetime.min.replace(tzinfo=UTC))
+        keys = [(times[n], c) for n, c in zip(self.labels, self.corrections, strict=True)]
+        return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
+
+    @property
+    def corrections(self) -> tuple[tuple[bool, bool], ...]:
+        """Whether offsets are active in each session, and whether its controller compensates.
+
+        Settings of single towers are the offsets of a printer.
         """
         settings = settings_of_sessions(self.problem.session)
-        corrected = np.abs(np.hstack([self.active, self.compensated])).max(axis=1) > 0.0
-        corrected |= [n in settings and settings[n].corrects_towers for n in self.labels]
-        times = self.times or dict.fromkeys(self.labels, datetime.min.replace(tzinfo=UTC))
-        keys = [(times[n], c) for n, c in zip(self.labels, corrected.tolist(), strict=True)]
-        return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
+        towers = [n in settings and settings[n].corrects_towers for n in self.labels]
+        offsets, backlashes = self.active.tolist(), self.compensated.tolist()
+        rows = zip(offsets, towers, backlashes, strict=True)
+        return tuple((any(values) or tower, any(others)) for values, tower, others in rows)
 
     @property
     def times(self) -> dict[str, datetime]:

@@ -467,10 +467,12 @@ def test_sessions_are_in_the_order_of_their_times(plan):
     assert LinearModel(join_sessions(equal)).order.tolist() == [1, 0, 2]
 
 
+@pytest.mark.parametrize("backlash", [0.0, 0.01e-3])
 @pytest.mark.parametrize("days", [(1, 2), ()])
-def test_sessions_in_another_order_are_found(plan, days):
+def test_sessions_in_another_order_are_found(plan, days, backlash):
     """The later one by its times, which is certain, or the one that states active offsets."""
     timed = days == (1, 2)
+    plan = replace(plan, compensation=(JointTrim(backlash),) * 3)
     sessions = [
         simulate_session(plan.with_controller(v), {}, seed=k).session
         for k, v in enumerate((0.0 * ENTERED, 0.0 * ENTERED if timed else ENTERED))

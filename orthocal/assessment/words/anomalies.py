@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 from orthocal.assessment.wording import (
     joined,
@@ -36,6 +37,9 @@ from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
 from orthocal.text import capitalised, spans, uncapitalised
 from orthocal.units import EDGE_UNITS, MM, UM, Unit, unit_in_text
+
+Correction = Literal["offsets", "compensation", "settings"]
+"""What a controller corrects: offsets, backlash and screws, or settings of a printer."""
 
 MAX_PLACES = 1000
 """Largest number of places in a finding, which limits the size of calibration.json."""
@@ -251,29 +255,37 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
-def describe_wrong_order(given: str, last: str, *, timed: bool, firmware: bool) -> Finding:
-    """Finding about joined sessions that were not given in the order of measuring.
+def describe_wrong_time(given: str, last: str) -> Finding:
+    """Finding about joined sessions that were not given in the order of their times.
 
     Args:
         given: Session that was given last.
         last: Session that was measured last.
-        timed: Whether the times of the readings state this; otherwise the active numbers.
-        firmware: Whether these are settings of a printer's firmware, not offsets.
     """
-    numbers = "settings" if firmware else "offsets"
-    assumed = (
-        f"The present {numbers} are assumed to be those of session {given}, which was given last."
+    return review(
+        "wrong order",
+        f"Session {given} was given last, but session {last} was measured later.",
+        f"Give session {last} last, or correct the times of the readings.",
     )
-    if timed:
-        return review(
-            "wrong order",
-            f"{assumed} But session {last} was measured later.",
-            f"Give session {last} last, or correct the times of the readings.",
-        )
+
+
+def describe_wrong_order(given: str, last: str, kind: Correction) -> Finding:
+    """Finding about joined sessions of which an earlier one has a correction that the last lacks.
+
+    Args:
+        given: Session that was given last.
+        last: Session with the correction.
+        kind: The correction.
+    """
+    lacking, numbers = {
+        "offsets": ("no offset is active", "offsets"),
+        "compensation": ("the controller compensates nothing", "compensation"),
+        "settings": ("the firmware corrects no tower", "settings"),
+    }[kind]
     return note(
         "wrong order",
-        f"{assumed} But its {'firmware' if firmware else 'controller'} corrects nothing, unlike "
-        f"that of session {last}.",
+        f"In session {given}, which was given last, {lacking}, unlike in session {last}. The "
+        f"present {numbers} are assumed to be those of session {given}.",
         f"If session {last} is the latest, give it last.",
     )
 
