@@ -69,7 +69,7 @@ def export(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
         home_offsets=_home_offsets(home_offset, joints, result),
-        latched=(joints.latched if joints else None) or _signs(latched),
+        latched=_latched(latched, joints),
         joint_limits=joints.limits if joints else None,
         half_side=None if half_side_mm is None else half_side_mm * MM,
         payload=payload,
@@ -116,8 +116,9 @@ def _note_assumptions(
     module: bool,
 ) -> None:
     """Note the assumed payload, order of sessions, and directions of homing onto the switches."""
+    from orthocal.assessment.wording import joined
     from orthocal.export.formats import note_wrong_order
-    from orthocal.export.linuxcnc.export import assumes_latching
+    from orthocal.export.linuxcnc.export import find_assumed_latching
     from orthocal.output.text.conditions import describe_assumed
 
     if module:
@@ -129,10 +130,12 @@ def _note_assumptions(
             "A kinematics module does not change HOME_OFFSET. For HOME_OFFSET of the offsets alone "
             "add --offsets."
         )
-    if assumes_latching(calibration, options):
-        unstated = "" if ini is None else f" ({ini} does not state it for every joint)"
+    if assumed := find_assumed_latching(calibration, options):
+        several = len(assumed) == len(calibration.robot.drives) > 1
+        joints = "all joints" if several else joined([f"JOINT_{i}" for i in assumed])
+        unstated = "" if ini is None else f" ({ini} does not state it)"
         put_note(
-            f"Assumed: HOME_LATCH_VEL of all joints is positive{unstated}. On its sign depends "
+            f"Assumed: HOME_LATCH_VEL of {joints} is positive{unstated}. On its sign depends "
             f"half of the backlash in {'the module' if module else 'HOME_OFFSET'}. If it is "
             f"negative, state the signs by {'--ini FILE or ' * (ini is None)}--latched."
         )
@@ -178,7 +181,10 @@ def _read_joints(
     if to != "linuxcnc":
         raise ParameterError("is an option of --to linuxcnc only", where="--ini")
     joints = read_controller_joints(path, calibration.robot)
-    in_file = {"--home-offset": joints.home_offsets, "--latched": joints.latched}
+    in_file = {
+        "--home-offset": joints.home_offsets,
+        "--latched": joints.latched if all(joints.latched) else None,
+    }
     for option, value in stated.items():
         if value is not None and in_file[option] is not None:
             raise ParameterError("is stated by --ini, too; state one of them", where=option)
@@ -245,18 +251,25 @@ def _home_offsets(
     return homes
 
 
-def _signs(text: str | None) -> tuple[int, ...] | None:
-    """Signs of an option, such as +,+,-; None if the option is absent.
+def _latched(text: str | None, joints: ControllerJoints | None) -> tuple[int, ...] | None:
+    """Signs of HOME_LATCH_VEL of an option, such as +,+,-, or of an INI file; None without both.
 
     Raises:
-        ParameterError: If a part is not a sign.
+        ParameterError: If a part is not a sign, or a sign contradicts the file.
     """
+    known = None if joints is None else joints.latched
     if text is None:
-        return None
+        return known
     signs = {"+": 1, "-": -1}
     parts = [part.strip() for part in text.split(",")]
     if not set(parts) <= signs.keys():
         raise ParameterError(
             f"found '{text}'; expected signs separated by commas, such as +,+,-", where="--latched"
         )
-    return tuple(signs[part] for part in parts)
+    stated = tuple(signs[part] for part in parts)
+    for i, (sign, in_file) in enumerate(zip(stated, known or (), strict=False)):
+        if sign == -in_file:
+            raise ParameterError(
+                f"contradicts the HOME_LATCH_VEL of JOINT_{i} in the INI file", where="--latched"
+            )
+    return stated

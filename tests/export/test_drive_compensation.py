@@ -487,7 +487,7 @@ def test_a_backlash_that_does_not_change_needs_no_direction_of_latching(calibrat
     homes = homes_of(calibration)
     assert any(home.compensation.backlash for home in homes)
     changed, same = (
-        describe_compensation(joints, stated=False, module=True)
+        describe_compensation(joints, module=True)
         for joints in (homes, [replace(home, was=home.compensation) for home in homes])
     )
     assert "latched in" in changed

@@ -393,7 +393,7 @@ def test_bad_options_are_refused(offsets, tmp_path, words, code, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"latched": (1, 0, 1)}, "--latched: found 0; expected 1 or -1"),
+        ({"latched": (1, 2, 1)}, "--latched: found 2; expected 1, 0 or -1"),
         ({"joint_limits": ((0.0, 1.0), (1.0, -1.0), (0.0, 1.0))}, "--ini: found limits 1 and -1"),
         ({"joint_limits": ((0.0, np.nan),) * 3}, "--ini: found limits 0 and nan"),
         ({"joint_limits": ((0.0, 1.0),)}, "--ini: found 1 range; expected 3"),

@@ -58,6 +58,7 @@ HOME_LATCH_VEL = -2
 ; BACKLASH = 0.5
 [JOINT_2]
 HOME_OFFSET = -3.25
+HOME_LATCH_VEL = 0.5
 COMP_FILE = trims.comp
 COMP_FILE_TYPE = 1
 BACKLASH = 0.2
@@ -114,11 +115,17 @@ def test_a_latch_against_the_search_is_noted(folder, orthoglide, capsys, effects
     assert ("[JOINT_0] has a HOME_LATCH_VEL whose sign" in capsys.readouterr().err) == noted
 
 
-def test_lines_of_an_export_state_no_direction_of_latching(folder, orthoglide):
-    """Which is then assumed and noted, instead of read as positive."""
-    lines = [v for v in INI.splitlines() if not v.startswith("HOME_LATCH")]
-    (folder / "machine.ini").write_text("\n".join(lines))
-    assert read_controller_joints(folder / "machine.ini", orthoglide).latched is None
+@pytest.mark.parametrize(
+    ("pattern", "line", "latched"),
+    [
+        ("HOME_LATCH_VEL.*", "", (0, 0, 0)),
+        ("HOME_LATCH_VEL = 0.5", "", (-1, 1, 0)),
+        ("HOME_LATCH_VEL = 0.5", "HOME_LATCH_VEL = 0", (-1, 1, 0)),
+    ],
+)
+def test_an_unstated_direction_of_latching_is_unknown(folder, orthoglide, pattern, line, latched):
+    (folder / "machine.ini").write_text(re.sub(pattern, line, INI))
+    assert read_controller_joints(folder / "machine.ini", orthoglide).latched == latched
 
 
 def test_a_machine_without_compensation_has_none(folder, orthoglide):
@@ -307,6 +314,27 @@ def test_latching_is_positive_by_default_and_said_to_be(folder, one, plain):
     assert len(entered[0]) == 3
 
 
+def test_the_assumed_direction_of_a_single_joint_is_named(folder, one, plain):
+    """If it is positive by assumption, the other number is beside it; an option states it."""
+    text = plain.read_text().replace("HOME_LATCH_VEL = 0.5", "")
+    (folder / "partial.ini").write_text(text)
+    done = export(folder, one, "assumed", "--ini", "partial.ini")
+    note = " ".join(done.stderr.split())
+    assert "Assumed: HOME_LATCH_VEL of JOINT_2 is positive (partial.ini does not state" in note
+    assert "--ini FILE" not in note
+    assert "The sign + of JOINT_2 is assumed" in (folder / "assumed/README.md").read_text()
+    lines = (folder / "assumed/joints.ini").read_text()
+    assert lines.count("# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET") == 1
+    done = export(folder, one, "stated", "--ini", "partial.ini", "--latched=-,+,-")
+    assert "Assumed" not in done.stderr
+    stated = (folder / "stated/joints.ini").read_text()
+    (other,) = re.findall(r"negative: (HOME_OFFSET = .*)", lines)
+    assert re.findall(r"(?m)^HOME_OFFSET = .*", stated)[2] == other
+    done = export(folder, one, "against", "--ini", "partial.ini", "--latched=+,+,-")
+    assert done.returncode == 2
+    assert "--latched: contradicts the HOME_LATCH_VEL of JOINT_0" in done.stderr
+
+
 def test_again_states_the_backlash_of_the_file(folder, one, plain):
     assert export(folder, one, "home", "--ini", plain).returncode == 0
     words = ["again", one, "--out", folder / "second", "--ini", folder / "home/joints.ini"]
@@ -480,6 +508,14 @@ def test_again_compares_home_offsets(folder, at_home, plain):
         assert "instead of" not in done.stderr
         stated = home_positions(load_plan(folder / f"second-{k}").compensation)
         assert np.array(stated) / MM == pytest.approx(found)
+    # a line that was not entered
+    entered = (folder / "entered.ini").read_text()
+    (folder / "partly.ini").write_text(re.sub("BACKLASH = .*\n", "", entered, count=1))
+    done = run_orthocal(folder, "again", at_home, "--out", "partly", "--ini", "partly.ini")
+    text = " ".join(done.stderr.split())
+    assert "says to enter, but JOINT_0 has BACKLASH 0 or none instead of BACKLASH 0." in text
+    assert "has HOME_OFFSET 3" not in text
+    assert home_positions(load_plan(folder / "partly").compensation) is None
     # one wrong number, whatever the comment states
     (folder / "wrong.ini").write_text(re.sub("(HOME_OFFSET = )3", r"\g<1>9", lines, count=1))
     result = load_calibration(at_home)

@@ -113,8 +113,8 @@ def without_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> dict[s
 class JointCompensation(JointTrim):
     """Compensation of one joint, with the direction in which homing latches its switch."""
 
-    latched: int = 1
-    """Sign of HOME_LATCH_VEL, 1 or -1."""
+    latched: int = 0
+    """Sign of HOME_LATCH_VEL, 1 or -1; 0 if unknown, which counts as 1."""
     error: float = 0.0
     """Largest error of the joint after compensation, [m, rad]: interpolation error of a table, or
     error of a constant BACKLASH, because backlash shifts the phase of a periodic error."""
@@ -135,8 +135,13 @@ class JointCompensation(JointTrim):
         """
         if self.table is not None and home is None:
             return 0.0
-        positive = (self.latched > 0) != opposite
+        positive = self.latches_upwards != opposite
         return float(self(np.array([home or 0.0]))[0, 0 if positive else 1])
+
+    @property
+    def latches_upwards(self) -> bool:
+        """True if homing latches the switch while the joint counts up, or by assumption."""
+        return self.latched >= 0
 
 
 def find_active_compensation(
@@ -148,7 +153,7 @@ def find_active_compensation(
 
     Args:
         calibration: The calibration.
-        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        latched: Sign of HOME_LATCH_VEL of each joint; 0 or None if unknown, which counts as 1.
         trims: Compensation of the joints, empty for none; by default the one that was active during
             the measurement.
 
@@ -157,7 +162,7 @@ def find_active_compensation(
     """
     drives, stated = calibration.robot.drives, calibration.session.compensation
     trims = (stated if trims is None else trims) or (JointTrim(),) * len(drives)
-    signs = (1,) * len(drives) if latched is None else tuple(latched)
+    signs = (0,) * len(drives) if latched is None else tuple(latched)
     if len(signs) != len(drives):
         names = ", ".join(d.name for d in drives)
         raise ParameterError(
@@ -274,7 +279,7 @@ def compensate_with_offsets(
 
     Args:
         calibration: The calibration.
-        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+        latched: Sign of HOME_LATCH_VEL of each joint; 0 or None if unknown, which counts as 1.
 
     Raises:
         ParameterError: If the numbers of directions and drives differ.

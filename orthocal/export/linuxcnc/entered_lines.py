@@ -67,7 +67,7 @@ def describe_other_lines(
         calibration: The calibration, with the adjustments since then.
         compensation: BACKLASH, COMP_FILE and HOME_OFFSET of the controller.
         offsets: Offsets that a comment of exported lines states, [m, rad]; None without it.
-        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
+        latched: Sign of HOME_LATCH_VEL of each joint; 0 or None if unknown.
         entered: Offsets that the new session states, shape (n_drives,), [m, rad].
         file: Name of the file with the lines.
 
@@ -87,17 +87,28 @@ def describe_other_lines(
             f"{file} has HOME_OFFSET for other offsets of the drives than the new session: "
             f"{values}. Enter lines with the offsets of the new session."
         )
+    pairs = _pair_trims(calibration, compensation)
+    other_trims = compare_joints(pairs)
     homes = expected_homes(calibration, compensation, latched)
-    if not sentences and (differences := compare_homes(calibration.robot, homes, compensation)):
-        sentences.append(
-            f"{file} does not have the offsets that the new session states. With its BACKLASH, "
-            f"{differences}. Enter lines with these offsets, and run `orthocal again --force` "
-            "once more."
-        )
-    elif differences := compare_joints(_pair_trims(calibration, compensation)):
+    if not sentences and (other := compare_homes(calibration.robot, homes, compensation)):
+        to_enter = tuple(trim for _, trim, _ in pairs)
+        homes = expected_homes(calibration, to_enter, latched) if other_trims else None
+        if homes is not None and not compare_homes(calibration.robot, homes, compensation):
+            sentences.append(
+                f"{file} has the HOME_OFFSET that this calibration says to enter, but "
+                f"{other_trims}. These lines belong together: enter them all, and run `orthocal "
+                "again --force` once more."
+            )
+        else:
+            sentences.append(
+                f"{file} does not have the offsets that the new session states. With its BACKLASH "
+                f"and its sign of HOME_LATCH_VEL, {other}. Enter lines with these offsets, and run "
+                "`orthocal again --force` once more."
+            )
+    elif other_trims:
         sentences.append(
             f"{file} differs from the lines that this calibration says to enter: "
-            f"{differences}. The new session states what the file contains: measure with "
+            f"{other_trims}. The new session states what the file contains: measure with "
             "these lines, or enter the others and run `orthocal again --force` once more."
         )
     return "\n".join(sentences)
@@ -160,7 +171,7 @@ def expected_homes(
     Args:
         calibration: The calibration, with the adjustments since then.
         stated: Compensation of the controller.
-        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
+        latched: Sign of HOME_LATCH_VEL of each joint; 0 or None if unknown.
 
     Returns:
         Shape (n_drives, 1) or (n_drives, 2), [m, rad]; None if the calibrated session does not
@@ -171,10 +182,13 @@ def expected_homes(
     if old is None:
         return None
     now = find_active_compensation(calibration, latched, stated)
-    changes = [[h.change, h.opposite] for h in find_homes(calibration, now, before, old)]
+    changes = [
+        [h.change, h.change if h.compensation.latched else h.opposite]
+        for h in find_homes(calibration, now, before, old)
+    ]
     homes = np.array(old)[:, None] + np.array(changes)
     same = np.ptp(homes, axis=1).max(initial=0.0) <= SAME_OFFSET
-    return np.asarray(homes[:, :1] if latched or same else homes)
+    return np.asarray(homes[:, :1] if same else homes)
 
 
 def states_homes(
@@ -185,7 +199,7 @@ def states_homes(
     Args:
         calibration: The calibration, with the adjustments since then.
         stated: Joints of the controller.
-        latched: Sign of HOME_LATCH_VEL of each joint; None if unknown.
+        latched: Sign of HOME_LATCH_VEL of each joint; 0 or None if unknown.
     """
     expected = expected_homes(calibration, stated, latched)
     if expected is None or home_positions(stated) is None:

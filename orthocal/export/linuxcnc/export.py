@@ -65,8 +65,8 @@ class ExportOptions:
     home_offsets: tuple[float, ...] | None = None
     """HOME_OFFSET of each joint during the measurement, [m, rad]."""
     latched: tuple[int, ...] | None = None
-    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 1 by default. It has an effect with backlash
-    only."""
+    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 0 if unknown, which counts as 1, the default.
+    It has an effect with backlash only."""
     joint_limits: tuple[tuple[float, float], ...] | None = None
     """MIN_LIMIT and MAX_LIMIT of each joint during the measurement, [m, rad]. The travel of the
     robot limits them too."""
@@ -93,8 +93,8 @@ class ExportOptions:
         if self.home_offsets is not None and not all(map(math.isfinite, self.home_offsets)):
             raise ParameterError("expected finite numbers", where="--home-offset")
         for sign in self.latched or ():
-            if sign not in (-1, 1):
-                raise ParameterError(f"found {sign!r}; expected 1 or -1", where="--latched")
+            if sign not in (-1, 0, 1):
+                raise ParameterError(f"found {sign!r}; expected 1, 0 or -1", where="--latched")
         for low, high in self.joint_limits or ():
             if not low < high:
                 raise ParameterError(
@@ -124,7 +124,6 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     """
     before = find_active_compensation(calibration, options.latched)
     options = replace(options, home_offsets=options.home_offsets or home_positions(before))
-    stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
     if module:
         compensation = find_compensation(calibration, options.latched)
@@ -148,8 +147,8 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         if h.compensation.table is not None and h.compensation.table is not h.was.table
     }
     if not module:
-        page = write_home_page(calibration, homes, stated=stated)
-        lines = write_home_lines(calibration, homes, stated=stated)
+        page = write_home_page(calibration, homes)
+        lines = write_home_lines(calibration, homes)
         return {"README.md": page, "joints.ini": lines, **tables}
     approximation = approximate(
         calibration,
@@ -159,8 +158,8 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         payload=options.payload,
     )
     return {
-        "README.md": write_module_page(calibration, approximation, homes, stated=stated),
-        "kinematics.ini": write_module_lines(approximation, homes, stated=stated),
+        "README.md": write_module_page(calibration, approximation, homes),
+        "kinematics.ini": write_module_lines(approximation, homes),
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
         **tables,
@@ -213,11 +212,16 @@ def _require_home_offsets(options: ExportOptions, joints: Sequence[JointCompensa
         )
 
 
-def assumes_latching(calibration: Calibration, options: ExportOptions) -> bool:
-    """True if the export depends on signs of HOME_LATCH_VEL that the options do not state."""
-    if options.latched is not None:
-        return False
-    old, new = (f(calibration, None) for f in (find_active_compensation, find_compensation))
-    if not compensates_alike(old, new):
-        return True
-    return any(e.change.any() for e in find_screws(calibration))
+def find_assumed_latching(calibration: Calibration, options: ExportOptions) -> tuple[int, ...]:
+    """Joints for which the export depends on a sign of HOME_LATCH_VEL that is not stated."""
+    old, new = (
+        f(calibration, options.latched) for f in (find_active_compensation, find_compensation)
+    )
+    screws = {e.drive for e in find_screws(calibration) if e.change.any()}
+    return tuple(
+        i
+        for i, (drive, was, joint) in enumerate(
+            zip(calibration.robot.drives, old, new, strict=True)
+        )
+        if not joint.latched and (drive.name in screws or not compensates_alike([was], [joint]))
+    )

@@ -15,6 +15,7 @@ from orthocal.assessment.controller_entries import (
     find_screws,
     offsets_to_enter,
 )
+from orthocal.assessment.wording import joined
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
     BEYOND_FACE,
@@ -40,21 +41,15 @@ SMALLEST_ERROR = 1e-9
 """Smallest error that README.md states, [m]."""
 
 
-def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
-    """INI lines with HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of each joint.
-
-    Args:
-        calibration: The calibration.
-        homes: The joints.
-        stated: Whether the directions in which homing latches the switches were stated.
-    """
+def write_home_lines(calibration: Calibration, homes: Sequence[JointHome]) -> str:
+    """INI lines with HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of each joint."""
     lines = ["# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines."]
     if calibration.session.controller_offsets is not None:  # otherwise only changes are known
         lines += [
             "# With these lines a session states the offsets of the drives:",
             f"# {_describe_offsets(calibration)}",
         ]
-    lines += _latching_lines(homes, stated=stated)
+    lines += _latching_lines(homes)
     for i, home in enumerate(homes):
         lines += [
             "",
@@ -62,7 +57,7 @@ def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, st
             f"# {comment_safe(home.drive.name)}, counts {home.counting}: "
             f"{home.show(home.change, sign=True)} {home.drive.joint_unit}",
             *_home_lines(home),
-            *([] if stated else _opposite_lines(home)),
+            *_opposite_lines(home),
             *_compensation_lines(i, home),
         ]
     return "\n".join(lines) + "\n"
@@ -74,26 +69,24 @@ def _describe_offsets(calibration: Calibration) -> str:
     return f"controller: {{{drive_keys('offsets', calibration.robot.drives, offsets)}}}"
 
 
-def _latching_lines(homes: Sequence[JointHome], *, stated: bool) -> list[str]:
-    """Comment with the signs of HOME_LATCH_VEL, which commands read from exported lines."""
-    signs = ", ".join("+" if h.compensation.latched > 0 else "-" for h in homes)
-    return [f"# signs of HOME_LATCH_VEL: [{signs}]"] if stated else []
+def _latching_lines(homes: Sequence[JointHome]) -> list[str]:
+    """Comment with the signs of HOME_LATCH_VEL for the next commands; none if one is unknown."""
+    signs = [_latching_sign(home) for home in homes]
+    known = all(home.compensation.latched for home in homes)
+    return [f"# signs of HOME_LATCH_VEL: [{', '.join(signs)}]"] if known else []
 
 
-def write_module_lines(
-    approximation: Approximation, homes: Sequence[JointHome], *, stated: bool
-) -> str:
-    """INI lines for the kinematics module: limits of the axes, unchanged joints.
+def _latching_sign(home: JointHome) -> str:
+    """Sign of HOME_LATCH_VEL, known or assumed."""
+    return "+" if home.compensation.latches_upwards else "-"
 
-    Args:
-        approximation: The machine of the module.
-        homes: The joints.
-        stated: Whether the directions in which homing latches the switches were stated.
-    """
+
+def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
+    """INI lines for the kinematics module: limits of the axes, unchanged joints."""
     coordinates, inverse = approximation.coordinates, approximation.inverse
     lines = [
         "# Calibrated kinematics module. HOME_OFFSET remains that of the measurement.",
-        *_latching_lines(homes, stated=stated),
+        *_latching_lines(homes),
         "",
         "[KINS]",
         "KINEMATICS = orthocal_kins",
@@ -131,8 +124,8 @@ def _home_lines(home: JointHome) -> list[str]:
 
 
 def _opposite_lines(home: JointHome) -> list[str]:
-    """Comments with the lines that differ for the other sign of HOME_LATCH_VEL."""
-    if not _depends_on_latching(home):
+    """Comments with the lines that differ for the other sign of an unknown HOME_LATCH_VEL."""
+    if not _assumes_latching(home):
         return []
     lines, opposite = _home_lines(home), _home_lines(replace(home, change=home.opposite))
     return [
@@ -142,9 +135,9 @@ def _opposite_lines(home: JointHome) -> list[str]:
     ]
 
 
-def _depends_on_latching(home: JointHome) -> bool:
-    """True if the printed HOME_OFFSET depends on the direction of latching."""
-    return home.show(home.change) != home.show(home.opposite)
+def _assumes_latching(home: JointHome) -> bool:
+    """True if the printed HOME_OFFSET depends on an unknown direction of latching."""
+    return not home.compensation.latched and home.show(home.change) != home.show(home.opposite)
 
 
 def _limit_lines(home: JointHome, limits: tuple[float, float] | None) -> list[str]:
@@ -192,19 +185,18 @@ _MOVED_TABLES = (
 )
 
 
-def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: bool = False) -> str:
+def describe_compensation(homes: Sequence[JointHome], *, module: bool = False) -> str:
     """Paragraph about BACKLASH and COMP_FILE; empty without them.
 
     Args:
         homes: Homes of the joints.
-        stated: Whether the signs of HOME_LATCH_VEL are stated.
         module: Whether a module displaces the joints, instead of HOME_OFFSET.
     """
     paragraphs = []
     changes = any(h.compensation_changes for h in homes)
     listed = ", ".join(
         f"JOINT_{i} {h.show(h.compensation.backlash)} {h.drive.joint_unit}"
-        + f" (latched in {'+' if h.compensation.latched > 0 else '-'} direction)" * changes
+        + f" (latched in {_latching_sign(h)} direction)" * changes
         for i, h in enumerate(homes)
         if h.compensation.backlash
     )
@@ -219,10 +211,11 @@ def describe_compensation(homes: Sequence[JointHome], *, stated: bool, module: b
             "are for the signs stated here. If one differs in your INI file, do not change it: "
             "export again with `--ini`."
         )
-        if not stated and any(map(_depends_on_latching, homes)):
+        assumed = [f"JOINT_{i}" for i, home in enumerate(homes) if _assumes_latching(home)]
+        if assumed:
             paragraphs[-1] += (
-                "\nThe signs + are assumed, because neither an INI file (`--ini FILE`) nor "
-                "`--latched` states them."
+                f"\nThe sign + of {joined(assumed)} is assumed, because neither an INI file "
+                "(`--ini FILE`) nor `--latched` states it."
             )
     with_table = [h for h in homes if h.compensation.table is not None]
     written = [h for h in with_table if h.compensation.table is not h.was.table]
@@ -302,14 +295,8 @@ def _describe_unchanged(calibration: Calibration, *, module: bool = False) -> st
     return paragraphs
 
 
-def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
-    """README.md for offsets that are entered as HOME_OFFSET.
-
-    Args:
-        calibration: The calibration.
-        homes: The joints.
-        stated: Whether the directions in which homing latches the switches were stated.
-    """
+def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
+    """README.md for offsets that are entered as HOME_OFFSET."""
     half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
     rows = []
     for i, home in enumerate(homes):
@@ -344,27 +331,15 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "scope": scope,
         "table": "\n".join(rows),
         "active": f"`{_describe_offsets(calibration)}`" if stated_offsets else UNSTATED,
-        "compensation": describe_compensation(homes, stated=stated)
-        + _describe_unchanged(calibration),
+        "compensation": describe_compensation(homes) + _describe_unchanged(calibration),
     }
     return fill_template("home_offset.md", values)
 
 
 def write_module_page(
-    calibration: Calibration,
-    approximation: Approximation,
-    homes: Sequence[JointHome],
-    *,
-    stated: bool,
+    calibration: Calibration, approximation: Approximation, homes: Sequence[JointHome]
 ) -> str:
-    """README.md of a kinematics module: steps to build and enter it, errors and limits.
-
-    Args:
-        calibration: The calibration.
-        approximation: The inverse kinematics of the module.
-        homes: The joints.
-        stated: Whether the directions in which homing latches the switches were stated.
-    """
+    """README.md of a kinematics module: steps to build and enter it, errors and limits."""
     inverse = approximation.inverse
     polynomial = inverse.correction
     letters = [c for k, c in enumerate(LETTERS) if k not in approximation.coordinates]
@@ -394,7 +369,7 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
-        "compensation": describe_compensation(homes, stated=stated, module=True)
+        "compensation": describe_compensation(homes, module=True)
         + _describe_conditions(approximation)
         + _describe_unchanged(calibration, module=True),
         "old_values": f" ({', '.join(old)})" if old else "",

@@ -50,9 +50,9 @@ class ControllerJoints:
 
     limits: tuple[tuple[float, float], ...]
     """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
-    latched: tuple[int, ...] | None
-    """Sign of HOME_LATCH_VEL, 1 or -1; None if neither a joint nor the comment of exported lines
-    states one."""
+    latched: tuple[int, ...]
+    """Sign of HOME_LATCH_VEL, 1 or -1, which the comment of exported lines may state; 0 if it is
+    missing or 0."""
     compensation: Compensation
     """BACKLASH, COMP_FILE and HOME_OFFSET of each joint. HOME_OFFSET is None if no joint states it
     or HOME_LATCH_VEL, as in a fragment that states changes only."""
@@ -100,7 +100,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     known = stated or any(home is not None for home in homes)
     return ControllerJoints(
         limits,
-        tuple(latch or 1 for latch in latched) if stated else _read_signs(text, robot.drives),
+        tuple(latch or 0 for latch in latched) if stated else _read_signs(text, robot.drives),
         with_homes(trims, [home or 0.0 for home in homes] if known else None),
         None if stated else _read_offsets(text, robot.drives),
         tuple(opposed),
@@ -127,11 +127,11 @@ def _require_unit(keys: Mapping[str, str], key: str, unit: str) -> None:
         raise ParameterError(f"{key} is {stated}; expected {unit}")
 
 
-def _read_signs(text: str, drives: Sequence[Drive]) -> tuple[int, ...] | None:
-    """Signs of HOME_LATCH_VEL that a comment of exported lines states; None without it."""
+def _read_signs(text: str, drives: Sequence[Drive]) -> tuple[int, ...]:
+    """Signs of HOME_LATCH_VEL that a comment of exported lines states; 0 without it."""
     match = EXPORTED_SIGNS.search(text)
     signs = () if match is None else tuple(1 if s == "+" else -1 for s in match[1].split(", "))
-    return signs if len(signs) == len(drives) else None
+    return signs if len(signs) == len(drives) else (0,) * len(drives)
 
 
 def _read_offsets(text: str, drives: Sequence[Drive]) -> tuple[float, ...] | None:
@@ -180,7 +180,7 @@ def _read_joint(
         table = read_comp_file(folder, name, drive)
     latch = None
     if "HOME_LATCH_VEL" in keys:
-        latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
+        latch = int(np.sign(numbers["HOME_LATCH_VEL"]))
     home = numbers["HOME_OFFSET"] * factor if "HOME_OFFSET" in keys else None
     return home, latch, JointTrim(numbers["BACKLASH"] * factor, table)
 
