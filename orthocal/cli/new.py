@@ -263,6 +263,7 @@ class _Design:
                 box = tuple((low, high) for low, high in robot.workspace.tolist())
                 self.machine = replace(self.machine, workspace=box)
             compensation = controller.read(robot)
+            equipment = controller.limit(equipment, robot)
             tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
             make_plan = _plan if reads_legs else _plan_bed
             self.plan: orthocal.MeasuringPlan | FixedPlan | None

@@ -240,11 +240,38 @@ class ControllerOptions:
         backlash (B[,B,...]): Backlash that the controller compensates, mm or degrees: one number
             for all drives or one for each; 0 for none.
         ini (FILE): INI file of LinuxCNC with BACKLASH and COMP_FILE, instead of --backlash, and
-            HOME_OFFSET. Motions beyond its soft limits are named.
+            HOME_OFFSET. Plans keep its soft limits; motions beyond them are named.
     """
 
     backlash: str | None = None
     ini: Path | None = None
+
+    def limit(
+        self,
+        equipment: orthocal.Equipment,
+        robot: orthocal.Robot,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> orthocal.Equipment:
+        """Equipment whose postures are within the soft limits of the INI file.
+
+        Args:
+            equipment: The equipment.
+            robot: The robot.
+            origin: Displayed tool coordinates in the origin of the world, [m].
+
+        Raises:
+            ParameterError: If the file does not fit the robot, or an axis leaves no room.
+        """
+        from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+
+        if self.ini is None:
+            return equipment
+        joints = read_controller_joints(self.ini, robot)
+        axes = [
+            (low - shift, high - shift)
+            for (low, high), shift in zip(joints.axis_limits, origin, strict=True)
+        ]
+        return equipment.within_limits(robot, joints.limits, axes)
 
     def read(self, robot: orthocal.Robot) -> Compensation | None:
         """Compensation of the controller; None without an option.

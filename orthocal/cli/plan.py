@@ -136,7 +136,6 @@ def _choose(
     from orthocal.effects.compensation import home_positions, with_homes
     from orthocal.effects.loading import with_effects
     from orthocal.kinematics.workspace import box_workspace
-    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
     from orthocal.robot.parameters import errors_at
 
     session, robot = load_robot_or_session(subject)
@@ -146,9 +145,8 @@ def _choose(
     if options.add is not None and options.setups is not None:
         raise ParameterError("found with --setups; expected one", where="--add")
     equipment, compensation = _read_equipment(options, robot, measured), controller.read(robot)
-    if controller.ini is not None:
-        limits = read_controller_joints(controller.ini, robot).limits
-        equipment = replace(equipment, soft_limits=limits)
+    origin = (0.0, 0.0, 0.0) if measured is None else measured.controller_origin
+    equipment = controller.limit(equipment, robot, origin)
     workspace = None
     if options.workspace_mm is not None:
         workspace = box_workspace(robot, read_workspace(options.workspace_mm, robot))

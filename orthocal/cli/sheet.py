@@ -136,4 +136,5 @@ def note_contradictions(
             "of HOME_LATCH_VEL before the first reading, because this moves the zero"
         )
     with suppress(SessionError):  # no measuring sheet, whose reason is printed
-        put_note(describe_beyond_limits(session, joints.limits, file=str(ini)))
+        limits = joints.limits, joints.axis_limits
+        put_note(describe_beyond_limits(session, *limits, file=str(ini)))

@@ -28,7 +28,7 @@ from orthocal.observation.conditions import (
 )
 from orthocal.planning.expected_error import state_noise
 from orthocal.planning.owned_sensors import Duration, OwnedSensor
-from orthocal.robot.model import Leg, Robot, require_commanded_tool
+from orthocal.robot.model import Leg, Robot, require_commanded_tool, require_tcp
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
@@ -42,6 +42,9 @@ DEFAULT_REACH = 0.1
 
 REACH_MARGIN = 0.005
 """Distance of postures from the end of the reach, which offsets of the machine reduce, [m]."""
+
+AXIS_ROOM = 0.002
+"""Distance of postures from soft limits of an axis, for approaches from either side, [m]."""
 
 BOX_STEP = 0.01
 """Step of the limits of the box, [m]."""
@@ -115,6 +118,39 @@ class Equipment:
                     f"'{rod}' is not a rod of leg {leg.name}; rods: {known}", where="touches"
                 )
         return [line.on_rod(rod, self.tip) for rod in self.rods or tuple(leg.rods)[:1]]
+
+    def within_limits(
+        self,
+        robot: Robot,
+        joints: Sequence[tuple[float, float]],
+        axes: Sequence[tuple[float, float]],
+    ) -> Equipment:
+        """Equipment whose postures are within soft limits of a controller.
+
+        Args:
+            robot: The robot.
+            joints: MIN_LIMIT and MAX_LIMIT of each joint, [m, rad].
+            axes: Those of the axes X, Y and Z in tool coordinates, [m].
+
+        Raises:
+            ParameterError: If the limits of an axis leave no room.
+        """
+        limited = replace(self, soft_limits=tuple(joints))
+        if not robot.commands_tool or not np.isfinite(axes).any():
+            return limited
+        coordinates = require_tcp(robot).coordinates
+        low, high = np.array([axes[c] for c in coordinates]).T
+        box = choose_box(robot, self.box)
+        box = np.column_stack(
+            [np.maximum(box[:, 0], low + AXIS_ROOM), np.minimum(box[:, 1], high - AXIS_ROOM)]
+        )
+        for c, (first, last) in zip(coordinates, box.tolist(), strict=True):
+            if first > last:
+                raise ParameterError(
+                    f"MIN_LIMIT and MAX_LIMIT of [AXIS_{'XYZ'[c]}] leave no room for postures",
+                    where="--ini",
+                )
+        return replace(limited, box=box)
 
     def limit_travel(self, robot: Robot) -> Robot:
         """Robot whose travel is within the soft limits.

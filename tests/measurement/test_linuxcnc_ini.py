@@ -100,8 +100,16 @@ def test_limits_that_limit_nothing_are_infinite(folder, orthoglide):
     text = INI.replace("[JOINT_0]\n", limits).replace("[JOINT_1]\n", "[JOINT_1]\nMIN_LIMIT = 5\n")
     (folder / "machine.ini").write_text(text)
     unlimited = (-np.inf, np.inf)
-    found = read_controller_joints(folder / "machine.ini", orthoglide).limits
-    assert found == (unlimited, (5 * MM, np.inf), unlimited)
+    found = read_controller_joints(folder / "machine.ini", orthoglide)
+    assert found.limits == (unlimited, (5 * MM, np.inf), unlimited)
+    assert found.axis_limits == (unlimited,) * 3
+    axes = "[AXIS_X]\nMIN_LIMIT = -60\nMAX_LIMIT = 70\n[AXIS_Z]\nMAX_LIMIT = 50\n"
+    (folder / "machine.ini").write_text(INI + axes)
+    found = read_controller_joints(folder / "machine.ini", orthoglide)
+    assert found.axis_limits == ((-60 * MM, 70 * MM), unlimited, (-np.inf, 50 * MM))
+    (folder / "machine.ini").write_text((INI + axes).replace("= 70", "= -70"))
+    with pytest.raises(ParameterError, match=r"\[AXIS_X\]: MIN_LIMIT is -60 mm, not below MAX"):
+        read_controller_joints(folder / "machine.ini", orthoglide)
 
 
 @pytest.mark.parametrize(("effects", "noted"), [(["backlash"], True), ([], False)])

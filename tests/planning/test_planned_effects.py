@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import timedelta
 
@@ -18,9 +19,12 @@ from orthocal import (
 )
 from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
+from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
+from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.conditions import MORNING, schedule_readings
 from orthocal.observation.gauge_noise import stated_sigma
 from orthocal.observation.model import predict_readings
@@ -135,14 +139,27 @@ def test_candidates_begin_their_approach_within_the_travel(machine):
 def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
     """The travel is 120 to 390 mm, and 310 mm in the mechanical zero."""
     robot = with_effects(orthoglide, effects)
-    limits = ((0.262, 0.353),) * 3
+    joints, axes = ((0.262, 0.353),) * 3, ((-0.035, 0.045), (-0.05, 0.03), (-np.inf, 0.04))
     with uncompared():
-        plans = [
-            plan_readings(robot, "offsets", setups=2, equipment=equipment, starts=1)
-            for equipment in (FEW, replace(FEW, soft_limits=limits))
-        ]
-    assert "MAX_LIMIT" in describe_beyond_limits(plans[0].session, limits, file="machine.ini")
-    assert describe_beyond_limits(plans[1].session, limits, file="machine.ini") == ""
+        free, limited = (
+            plan_readings(robot, "offsets", setups=2, equipment=equipment, starts=1).session
+            for equipment in (FEW, FEW.within_limits(robot, joints, axes))
+        )
+    beyond = describe_beyond_limits(free, joints, axes, file="machine.ini")
+    assert re.search(r"(?m)^  AXIS_[XYZ], MAX_LIMIT", beyond)
+    assert "MAX_LIMIT" in describe_beyond_limits(free, joints, file="machine.ini")
+    assert describe_beyond_limits(limited, joints, axes, file="machine.ini") == ""
+    # the farthest displayed coordinates are those of the program's lines
+    origin = (0.001, 0.002, 0.003)
+    shifted = replace(free, controller_origin=origin)
+    beyond = describe_beyond_limits(shifted, [(-1.0, 1.0)] * 3, axes, file="machine.ini")
+    reached = [float(v) for v in re.findall(r"reaches (\S+?)[, ]", beyond.replace("−", "-"))]
+    programs = "".join(write_program(shifted, motion) for motion in plan_motion(shifted))
+    words = np.array(re.findall(r" [XYZ]([-\d.]+)", programs), dtype=float)
+    assert reached
+    assert all(np.abs(words - v).min() < 6e-4 for v in reached)  # rounded to 1 µm
+    with pytest.raises(ParameterError, match=r"\[AXIS_Y\] leave no room"):
+        FEW.within_limits(robot, joints, (axes[0], (0.2, 0.3), axes[2]))
 
 
 def test_positions_lie_at_fractions_of_the_lead(orthoglide):

@@ -24,6 +24,7 @@ from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
 from orthocal.measurement.files.session_keys import LARGEST_TRIM
 from orthocal.robot.model import Drive, Robot
+from orthocal.units import MM
 
 COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
@@ -50,6 +51,8 @@ class ControllerJoints:
 
     limits: tuple[tuple[float, float], ...]
     """MIN_LIMIT and MAX_LIMIT, [m, rad]; infinite if not stated."""
+    axis_limits: tuple[tuple[float, float], ...]
+    """Those of the axes X, Y and Z, which programs of tool coordinates must keep, [m]."""
     latched: tuple[int, ...]
     """Sign of HOME_LATCH_VEL, 1 or -1, which the comment of exported lines may state; 0 if it is
     missing or 0."""
@@ -94,12 +97,14 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
             home, latch, trim = _read_joint(keys, drive, folder=path.parent)
             if (latch or 0) * _read_number(keys, "HOME_SEARCH_VEL") < 0.0:
                 opposed.append(f"[JOINT_{i}]")
-            joints.append((home, _read_limits(keys, drive), latch, trim))
+            of_joint = _read_limits(keys, drive.joint_unit, drive.joint_size)
+            joints.append((home, of_joint, latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
     known = stated or any(home is not None for home in homes)
     return ControllerJoints(
         limits,
+        tuple(_read_axis(sections, letter, path) for letter in "XYZ"),
         tuple(latch or 0 for latch in latched) if stated else _read_signs(text, robot.drives),
         with_homes(trims, [home or 0.0 for home in homes] if known else None),
         None if stated else _read_offsets(text, robot.drives),
@@ -185,25 +190,42 @@ def _read_joint(
     return home, latch, JointTrim(numbers["BACKLASH"] * factor, table)
 
 
-def _read_limits(keys: Mapping[str, str], drive: Drive) -> tuple[float, float]:
-    """MIN_LIMIT and MAX_LIMIT of a joint, [m, rad]; infinite if not stated.
+def _read_axis(
+    sections: Mapping[str, Mapping[str, str]], letter: str, path: Path
+) -> tuple[float, float]:
+    """MIN_LIMIT and MAX_LIMIT of an axis, [m]; infinite if not stated.
+
+    Raises:
+        ParameterError: If they are wrong, or not in mm; names file and section.
+    """
+    keys = sections.get(f"AXIS_{letter}", {})
+    if keys:
+        with errors_at(f"{path}: [TRAJ]"):
+            _require_unit(sections.get("TRAJ", {}), UNIT_KEYS["mm"], "mm")
+    with errors_at(f"{path}: [AXIS_{letter}]"):
+        return _read_limits(keys, "mm", MM)
+
+
+def _read_limits(keys: Mapping[str, str], unit: str, factor: float) -> tuple[float, float]:
+    """MIN_LIMIT and MAX_LIMIT of a joint or an axis, [m, rad]; infinite if not stated.
 
     Numbers beyond LARGEST_NUMBER are infinite, too: for LinuxCNC, ±1e99 means no limit.
+
+    Args:
+        keys: Keys of its section.
+        unit: Its unit, mm or deg.
+        factor: Metres or radians of this unit.
 
     Raises:
         ParameterError: If one is no number, or the lowest is above the highest.
     """
-    factor = drive.joint_size
     stated = (
         parse_number(keys.get(key, default), name=key, error=ParameterError, largest=math.inf)
         for key, default in (("MIN_LIMIT", "-1e99"), ("MAX_LIMIT", "1e99"))
     )
     low, high = (v if abs(v) <= LARGEST_NUMBER else math.copysign(math.inf, v) for v in stated)
     if low >= high:
-        raise ParameterError(
-            f"MIN_LIMIT is {low:g} {drive.joint_unit}, not below MAX_LIMIT, "
-            f"{high:g} {drive.joint_unit}"
-        )
+        raise ParameterError(f"MIN_LIMIT is {low:g} {unit}, not below MAX_LIMIT, {high:g} {unit}")
     return low * factor, high * factor
 
 

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from orthocal.measurement.motion.guidance import shown_joints
+from orthocal.arrays import Array
+from orthocal.measurement.motion.guidance import shown_joints, shown_tool
 from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.motion.stops import Stop
+from orthocal.robot.model import require_tcp
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Session
-from orthocal.units import DRIVE_UNITS, format_fixed
+from orthocal.units import DRIVE_UNITS, Unit, format_fixed
 
 ROUNDING = 1e-6
 """Largest excess over a limit that is ignored, [m, rad]: limits are written to 1 µm."""
@@ -20,29 +23,43 @@ MOST_PLACES = 4
 
 
 def describe_beyond_limits(
-    session: Session, limits: Sequence[tuple[float, float]], *, file: str
+    session: Session,
+    limits: Sequence[tuple[float, float]],
+    axis_limits: Sequence[tuple[float, float]] = (),
+    *,
+    file: str,
 ) -> str:
-    """Motions of the programs beyond the soft limits of joints, and the remedy; "" without any.
+    """Motions of the programs beyond soft limits, and the remedy; "" without any.
 
     The path to each posture counts, with its approach.
 
     Args:
         session: The plan.
         limits: MIN_LIMIT and MAX_LIMIT of each joint, [m, rad].
+        axis_limits: Those of the axes X, Y and Z, [m]; by default none.
         file: Name of the file with the limits.
 
     Raises:
         SessionError: If the machine cannot go through the plan.
     """
+    robot = session.robot
+    titles: list[tuple[str, Unit]] = [
+        (f"JOINT_{i} ({d.name})", d.unit) for i, d in enumerate(robot.drives)
+    ]
+    all_limits = list(limits)
+    if axis_limits and robot.commands_tool:
+        coordinates = require_tcp(robot).coordinates
+        titles += [(f"AXIS_{'XYZ'[c]}", "m") for c in coordinates]
+        all_limits += [axis_limits[c] for c in coordinates]
     lines = [
-        _describe_beyond(session, i, key, limit, places)
-        for (i, key, limit), places in _find_beyond(session, limits).items()
+        _describe_beyond(*titles[i], key, limit, places)
+        for (i, key, limit), places in _find_beyond(session, all_limits).items()
     ]
     if not lines:
         return ""
     head = f"{file}: the controller refuses motions of this plan, which exceed its soft limits."
     remedy = (
-        "If the drive can go there, widen the limit. Otherwise change these postures in "
+        "If the machine can go there, widen the limit. Otherwise change these postures in "
         "session.yaml or their approach in readings.csv, and run `orthocal sheet --ini`."
     )
     return "\n".join([head, *lines, remedy])
@@ -51,20 +68,24 @@ def describe_beyond_limits(
 def _find_beyond(
     session: Session, limits: Sequence[tuple[float, float]]
 ) -> dict[tuple[int, str, float], dict[tuple[str, str], float]]:
-    """Farthest coordinate of a joint on the way to each posture beyond a limit, [m, rad].
+    """Farthest coordinate of a joint or an axis on the way to each posture beyond a limit.
+
+    Args:
+        session: The plan.
+        limits: Limits of the joints, and of the axes after them if they count, [m, rad].
 
     Returns:
-        Coordinates by (number of the joint, key of the limit, limit), then by setup and posture.
+        Coordinates, [m, rad], by (index of the limits, key of the limit, limit), then by setup and
+        posture.
     """
     beyond: dict[tuple[int, str, float], dict[tuple[str, str], float]] = {}
     for motion in plan_motion(one_row_per_point(session)):
         alignment = () if motion.alignment is None else (motion.alignment,)
         for stop in (*alignment, *motion.stops):
-            path = np.array([stop.approach_drives, stop.drives]) if stop.path is None else stop.path
-            shown = shown_joints(session.robot, path)
-            for i, (low, high) in enumerate(limits):
+            shown = _shown_on_path(session, stop)
+            for i, ((low, high), coordinates) in enumerate(zip(limits, shown, strict=False)):
                 for key, limit, sign in (("MIN_LIMIT", low, -1.0), ("MAX_LIMIT", high, 1.0)):
-                    farthest = (sign * shown[:, i]).max()
+                    farthest = (sign * coordinates).max()
                     if farthest > sign * limit + ROUNDING:
                         places = beyond.setdefault((i, key, limit), {})
                         place = motion.setup, stop.posture
@@ -73,26 +94,39 @@ def _find_beyond(
     return beyond
 
 
+def _shown_on_path(session: Session, stop: Stop) -> list[Array]:
+    """Coordinates that the controller displays on the way to a stop, [m, rad].
+
+    Those of each joint, then those of each commanded coordinate of the tool.
+    """
+    path = np.array([stop.approach_drives, stop.drives]) if stop.path is None else stop.path
+    shown = list(shown_joints(session.robot, path).T)
+    if stop.point is None or stop.approach_point is None:
+        return shown
+    corners = np.array([*stop.via, stop.approach_point, stop.point])  # straight lines between them
+    coordinates = list(require_tcp(session.robot).coordinates)
+    origin = np.array(session.controller_origin)[coordinates]
+    return [*shown, *(shown_tool(session, corners) + origin).T]
+
+
 def _describe_beyond(
-    session: Session, joint: int, key: str, limit: float, places: dict[tuple[str, str], float]
+    title: str, unit_of: Unit, key: str, limit: float, places: dict[tuple[str, str], float]
 ) -> str:
-    """Line about a limit: setups and postures with the farthest coordinate of the joint.
+    """Line about a limit: setups and postures with the farthest coordinate.
 
     Args:
-        session: The plan.
-        joint: Number of the joint.
+        title: Section of the INI file.
+        unit_of: SI unit of the coordinate.
         key: Key of the limit.
         limit: The limit, [m, rad].
         places: Farthest coordinate by setup and posture, [m, rad].
     """
-    drive = session.robot.drives[joint]
-    unit, size = DRIVE_UNITS[drive.unit]
+    unit, size = DRIVE_UNITS[unit_of]
     named = [
         f"{setup} {posture} reaches {format_fixed(value / size, 3)}"
         for (setup, posture), value in list(places.items())[:MOST_PLACES]
     ]
     more = f" and {len(places) - MOST_PLACES} more" if len(places) > MOST_PLACES else ""
     return (
-        f"  JOINT_{joint} ({drive.name}), {key} {format_fixed(limit / size, 3)} {unit}: "
-        f"{', '.join(named)} {unit}{more}"
+        f"  {title}, {key} {format_fixed(limit / size, 3)} {unit}: {', '.join(named)} {unit}{more}"
     )
