@@ -99,16 +99,21 @@ def join_texts(texts: Sequence[str]) -> str:
 def _after_place(finding: Finding) -> str:
     """Action of a finding after its place, such as "Setup yx, line 4: read it again.".
 
-    Of several places in one setup it is the first one.
+    Of several places in one setup it is the first one. The text of the finding is not before it.
     """
-    place, action = finding.places[0] if finding.places else Place(), finding.action
+    place = finding.places[0] if finding.places else Place()
+    action = finding.action.replace("If so, ", "If this was the mistake, ", 1)
     if place.setup is None and place.parameter is None:
         return action
     line = "" if place.line is None else f", line {place.line}"
-    label = place.parameter if place.setup is None else f"Setup {place.setup}{line}"
     setups = list(dict.fromkeys(p.setup for p in finding.places if p.setup is not None))
     if len(setups) > 1:
         label = f"Setups {list_some(setups, MOST_SETUPS)}"
+    elif setups:
+        label = f"Setup {setups[0]}{line}"
+    else:
+        parameters = dict.fromkeys(p.parameter for p in finding.places if p.parameter is not None)
+        label = list_some(list(parameters), MOST_SETUPS)
     return f"{label}: {uncapitalised(action)}"
 
 

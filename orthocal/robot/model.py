@@ -585,7 +585,7 @@ def drive_keys(
     """
     texts: dict[str, list[str]] = {}
     for drive, value in zip(drives, values or [0.0] * len(drives), strict=True):
-        texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.6g}")
+        texts.setdefault(drive.joint_unit, []).append(f"{value / drive.joint_size:.8g}")
     return ", ".join(f"{quantity}_{unit}: [{', '.join(v)}]" for unit, v in texts.items())
 
 

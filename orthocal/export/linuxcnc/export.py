@@ -147,7 +147,8 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         if h.compensation.table is not None and h.compensation.table is not h.was.table
     }
     if not module:
-        page = write_home_page(calibration, homes)
+        own_limits = options.joint_limits is not None
+        page = write_home_page(calibration, homes, own_limits=own_limits)
         lines = write_home_lines(calibration, homes)
         return {"README.md": page, "joints.ini": lines, **tables}
     approximation = approximate(

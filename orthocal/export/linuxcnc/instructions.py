@@ -295,8 +295,16 @@ def _describe_unchanged(calibration: Calibration, *, module: bool = False) -> st
     return paragraphs
 
 
-def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
-    """README.md for offsets that are entered as HOME_OFFSET."""
+def write_home_page(
+    calibration: Calibration, homes: Sequence[JointHome], *, own_limits: bool
+) -> str:
+    """README.md for offsets that are entered as HOME_OFFSET.
+
+    Args:
+        calibration: The calibration.
+        homes: The joints.
+        own_limits: Whether the limits are those of the controller, not only the robot's travel.
+    """
     half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
     rows = []
     for i, home in enumerate(homes):
@@ -331,9 +339,21 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         "scope": scope,
         "table": "\n".join(rows),
         "active": f"`{_describe_offsets(calibration)}`" if stated_offsets else UNSTATED,
+        "limits": _describe_limits(homes, own=own_limits),
         "compensation": describe_compensation(homes) + _describe_unchanged(calibration),
     }
     return fill_template("home_offset.md", values)
+
+
+def _describe_limits(homes: Sequence[JointHome], *, own: bool) -> str:
+    """Sentence about narrower soft limits of the controller."""
+    if own:
+        return "They contain the narrower limits of your INI file."
+    changes = ", ".join(
+        f"JOINT_{i} {home.show(home.limit_change, sign=True)} {home.drive.joint_unit}"
+        for i, home in enumerate(homes)
+    )
+    return f"Narrower limits of your own change by: {changes}."
 
 
 def write_module_page(

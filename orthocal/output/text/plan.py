@@ -65,6 +65,9 @@ FORMS: dict[Criterion, str] = {
 PLAN_BASIS = {"travel": "travel", "workspace_mm": "workspace"}
 """Keys of plan.json for the properties of the machine on which a plan depends, with words."""
 
+ALIKE = 0.03
+"""Relative difference of durations and errors below which a plan is as good as another one."""
+
 SOME_LOST = 0.01
 """Fraction of impossible readings above which the plan says so."""
 
@@ -394,8 +397,8 @@ def _when_enough(plan: MeasuringPlan) -> str:
             f"instead of {um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
             f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)}).{other}"
         )
-    as_good = plan.stage.minutes <= enough.minutes and plan.stage.error <= enough.error
-    if as_good or um(enough.error) == um(plan.stage.error):
+    as_long = plan.stage.minutes < (1.0 + ALIKE) * enough.minutes
+    if as_long and plan.stage.error < (1.0 + ALIKE) * enough.error:
         return f"Further setups gain less than {HOURLY_GAIN:.0%} an hour."
     return (
         f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
