@@ -32,8 +32,14 @@ from orthocal import (
 from orthocal.assessment import judgement as judgement_module
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.wording import describe_actions
-from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
+from orthocal.assessment.wording import describe_actions, parameter_places, review
+from orthocal.calibration.assessment_record import (
+    EXIT_CODES,
+    Finding,
+    FindingKind,
+    Place,
+    Severity,
+)
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.measurement.joining import join_sessions
@@ -221,6 +227,19 @@ def test_missing_readings_of_joined_sessions_have_lines_of_their_files(experimen
     session = join_sessions([unread("a", 3), unread("b", 1, 3)])
     places = "a/readings.csv: line 5; b/readings.csv: lines 3, 5"
     assert describe_missing(session) == f"3 of 12 readings are missing ({places})"
+
+
+def test_a_step_in_a_list_names_all_drives_and_repeats_the_condition():
+    """The text of the finding is not before it."""
+    drives = parameter_places("x_slide", "z_slide")
+    findings = [
+        review("not entered", "Not entered.", "Enter them.", drives),
+        review("swapped rows", "Swapped.", "If so, swap them.", [Place(setup="xy", line=3)]),
+    ]
+    assert describe_actions(findings).splitlines()[1:] == [
+        "  1. x_slide, z_slide: enter them.",
+        "  2. Setup xy, line 3: if this was the mistake, swap them.",
+    ]
 
 
 def test_the_next_step_of_a_decision_is_about_each_finding(cycles):

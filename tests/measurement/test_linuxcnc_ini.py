@@ -37,6 +37,8 @@ from orthocal.effects.compensation import (
 from orthocal.effects.loading import with_effects
 from orthocal.export.linuxcnc import entered_lines
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+from orthocal.output.text.answer import render_answer
+from orthocal.output.text.layout import to_text
 from orthocal.units import DEG
 
 MM = 1e-3
@@ -297,9 +299,14 @@ def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
         text = (folder / name / "joints.ini").read_text()
         found = re.findall(r"^(?:MIN|MAX)_LIMIT = (\S+)", text, re.M)
         limits.append(np.array(found, dtype=float).reshape(3, 2))
+    page = " ".join((folder / "narrow/README.md").read_text().split())
+    assert "They contain the narrower limits of your INI file." in page
     change = limits[1] - limits[0]
     assert limits[0][1] == pytest.approx((120.0, 390.0), abs=1.0)
     offset = limits[0][1, 0] - 120.0
+    assert export(folder, one, "none", "--home-offset", "352.5,340,-3.25").returncode == 0
+    page = " ".join((folder / "none/README.md").read_text().split())
+    assert float(re.search(r"change by: .* JOINT_1 (\S+) mm", page)[1]) == pytest.approx(offset)
     assert limits[1][1, 0] == pytest.approx(160.0 + offset, abs=1e-3)
     change[1, 0] = 0.0
     assert not change.any()
@@ -466,6 +473,16 @@ def test_export_begins_with_the_home_offsets_of_the_session(folder, at_home, pla
     entered = [re.findall(r"(?m)^HOME_OFFSET = .*", text) for text in texts]
     assert entered[0] == entered[1]
     assert len(entered[0]) == 3
+
+
+def test_the_next_commands_of_linuxcnc_export_first(one, at_home):
+    """If the session states HOME_OFFSET; the new session is that of the exported lines."""
+    for path, linuxcnc in ((one, False), (at_home, True)):
+        answer = to_text(render_answer(load_calibration(path), saved=path))
+        export = f"  orthocal export {path} --to linuxcnc --offsets --ini FILE --out {path}-home\n"
+        again = f"  orthocal again {path} --ini {path}-home/joints.ini --out "
+        assert (export + again in answer) == linuxcnc
+        assert (f"  orthocal again {path} --out " in answer) != linuxcnc
 
 
 def test_offsets_are_not_entered_twice(folder, at_home, plain):

@@ -31,6 +31,7 @@ from orthocal.calibration.assessment_record import (
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.refit import restore_session
+from orthocal.effects.compensation import home_positions
 from orthocal.output.text.accuracy import FurtherHour, describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
@@ -242,14 +243,16 @@ def _next_step(
         )
     paths = (saved, next_session(calibration, saved), f"{saved}-linuxcnc")
     directory, new, module = (quote_path(path) for path in paths)
+    home = f"{saved}-home"
+    offsets = (
+        f"orthocal export {directory} --to linuxcnc --offsets --ini FILE --out {quote_path(home)}"
+    )
     gains = gains_from_correction(calibration, assessment.tool)
     if gains and (unchanged or calibration.measured_again):
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
             words = uncapitalised(CHOICE_STEP)
         active = "" if unchanged else " --offsets active"
-        home = quote_path(f"{saved}-home")
-        offsets = f"orthocal export {directory} --to linuxcnc --offsets --ini FILE --out {home}"
         return words, (
             *(() if unchanged else (offsets,)),
             f"orthocal export {directory} --to linuxcnc --out {module}",
@@ -263,8 +266,11 @@ def _next_step(
             f"enter {joined(changes)} (for LinuxCNC: `orthocal export`), home the machine and "
             "measure again."
         )
+    in_linuxcnc = bool(changes) and home_positions(calibration.session.compensation) is not None
+    ini = f" --ini {quote_path(f'{home}/joints.ini')}" if in_linuxcnc else ""
     return words, (
-        f"orthocal again {directory} --out {new}",
+        *([offsets] if in_linuxcnc else []),
+        f"orthocal again {directory}{ini} --out {new}",
         f"orthocal record {new}",
         f"orthocal validate {directory} {new}",
     )
