@@ -56,7 +56,7 @@ BACKLASH = 0.031
 [JOINT_1]
 HOME_OFFSET = 340
 HOME_LATCH_VEL = 2
-HOME_LATCH_VEL = -2
+HOME_LATCH_VEL = 2
 ; BACKLASH = 0.5
 [JOINT_2]
 HOME_OFFSET = -3.25
@@ -136,6 +136,19 @@ def test_a_latch_against_the_search_is_noted(folder, orthoglide, capsys, effects
 def test_an_unstated_direction_of_latching_is_unknown(folder, orthoglide, pattern, line, latched):
     (folder / "machine.ini").write_text(re.sub(pattern, line, INI))
     assert read_controller_joints(folder / "machine.ini", orthoglide).latched == latched
+
+
+def test_a_key_with_two_values_is_refused(folder, orthoglide):
+    """As if the exported lines were appended: LinuxCNC would not read them."""
+    path, appended = folder / "machine.ini", "\n[JOINT_1]\n# new\nHOME_OFFSET = {}\n"
+    path.write_text(INI + appended.format(340))
+    assert read_controller_joints(path, orthoglide).home_offsets[1] == pytest.approx(0.34)
+    path.write_text(INI + appended.format(341.5))
+    line = len((INI + appended).splitlines())
+    first = INI.splitlines().index("HOME_OFFSET = 340") + 1
+    expected = rf"ini:{line}: \[JOINT_1\] has HOME_OFFSET = 341.5, but 340 in line {first}"
+    with pytest.raises(ParameterError, match=expected):
+        read_controller_joints(path, orthoglide)
 
 
 def test_a_machine_without_compensation_has_none(folder, orthoglide):

@@ -38,6 +38,11 @@ EXPORTED_SIGNS = re.compile(r"(?m)^# signs of HOME_LATCH_VEL: \[([+-](?:, [+-])*
 OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
 """Offsets of the drives with one unit in this comment."""
 
+KEYS = frozenset(
+    ("LINEAR_UNITS", "ANGULAR_UNITS", "UNITS", "MIN_LIMIT", "MAX_LIMIT", "BACKLASH", "COMP_FILE", "COMP_FILE_TYPE", "HOME_OFFSET", "HOME_LATCH_VEL", "HOME_SEARCH_VEL")
+)
+"""Keys that are read from the sections of the trajectory, the joints and the axes."""
+
 UNIT_KEYS = {"mm": "LINEAR_UNITS", "deg": "ANGULAR_UNITS"}
 """Keys of [TRAJ] that state the unit of a drive, by this unit."""
 
@@ -233,10 +238,12 @@ def _read_sections(text: str, path: Path) -> Mapping[str, Mapping[str, str]]:
     """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC.
 
     Raises:
-        ParameterError: If the file includes another one; names the line.
+        ParameterError: If the file includes another one, or states a key of KEYS twice with
+            different values; names the line.
     """
     sections = dict[str, dict[str, str]]()
-    current = dict[str, str]()
+    lines = dict[tuple[str, str], int]()
+    section, current = "", dict[str, str]()
     for number, line in enumerate(text.splitlines(), start=1):
         if line.lstrip().startswith("#INCLUDE"):
             raise ParameterError(
@@ -245,10 +252,17 @@ def _read_sections(text: str, path: Path) -> Mapping[str, Mapping[str, str]]:
             )
         bare = re.sub(r"(^|\s)[#;].*", "", line).strip()  # without its comment
         if bare.startswith("[") and bare.endswith("]"):
-            current = sections.setdefault(bare[1:-1].strip(), {})
+            section = bare[1:-1].strip()
+            current = sections.setdefault(section, {})
         elif "=" in bare:
-            key, _, value = bare.partition("=")
-            current.setdefault(key.strip(), value.strip())
+            key, value = (part.strip() for part in bare.split("=", 1))
+            first = lines.setdefault((section, key), number)
+            if current.setdefault(key, value) != value and key in KEYS:
+                raise ParameterError(
+                    f"[{section}] has {key} = {value}, but {current[key]} in line {first}, and "
+                    "LinuxCNC uses the first one; expected one line",
+                    where=f"{path}:{number}",
+                )
     return sections
 
 
