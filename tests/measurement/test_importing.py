@@ -284,8 +284,8 @@ FORMS = [
     text("two-readings-assigned", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
          one("0.6"), columns={"reading": "Anzeige_mm"}),
     text("beyond-the-gauge", HEAD + "xy;zero;500,5\n", "{}:2: reading_mm is 500.5; expected a "
-         "number within ±300, the limit of this kind of sensor; for readings in µm use "
-         "`orthocal import --unit um`"),
+         "number within ±300, the limit of this kind of sensor; for readings in µm or in "
+         "hundredths of a mm use `orthocal import` with `--unit um` or `--unit hundredths`"),
     text("nothing", "", "{}: is empty; expected the headings setup, posture and reading"),
     text("no-rows", HEAD, "{}: holds no readings"),
     text("open-quote", f'{HEAD}xy;"zero;0,5\n', "{}:2: is not valid CSV: unexpected end of data"),

@@ -39,7 +39,19 @@ OFFSETS_OF_UNIT = re.compile(r"offsets_(\w+): \[([^\]]*)\]")
 """Offsets of the drives with one unit in this comment."""
 
 KEYS = frozenset(
-    ("LINEAR_UNITS", "ANGULAR_UNITS", "UNITS", "MIN_LIMIT", "MAX_LIMIT", "BACKLASH", "COMP_FILE", "COMP_FILE_TYPE", "HOME_OFFSET", "HOME_LATCH_VEL", "HOME_SEARCH_VEL")
+    {
+        "ANGULAR_UNITS",
+        "BACKLASH",
+        "COMP_FILE",
+        "COMP_FILE_TYPE",
+        "HOME_LATCH_VEL",
+        "HOME_OFFSET",
+        "HOME_SEARCH_VEL",
+        "LINEAR_UNITS",
+        "MAX_LIMIT",
+        "MIN_LIMIT",
+        "UNITS",
+    }
 )
 """Keys that are read from the sections of the trajectory, the joints and the axes."""
 
@@ -134,7 +146,10 @@ def _require_unit(keys: Mapping[str, str], key: str, unit: str) -> None:
     """
     stated = keys.get(key)
     if stated is not None and stated.casefold() not in UNIT_WORDS[unit]:
-        raise ParameterError(f"{key} is {stated}; expected {unit}")
+        raise ParameterError(
+            f"{key} is {stated}; expected {unit}. For a controller with other units leave out "
+            f"--ini, and state numbers in {unit}: --backlash, and --home-offset of `export`"
+        )
 
 
 def _read_signs(text: str, drives: Sequence[Drive]) -> tuple[int, ...]:

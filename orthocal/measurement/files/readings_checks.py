@@ -28,7 +28,10 @@ from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Ses
 from orthocal.text import shorten, spans
 from orthocal.units import MM
 
-UNIT_HINT = "; for readings in µm use `orthocal import --unit um`"
+UNIT_HINT = (
+    "; for readings in µm or in hundredths of a mm use `orthocal import` with `--unit um` or "
+    "`--unit hundredths`"
+)
 """Action in case of a wrong unit."""
 
 UNIT_HINT_RATIO = 5.0
@@ -390,7 +393,8 @@ def check_range(
     ratio = abs(value_mm) / max(-lowest, highest)
     of_setup = np.asarray(of_setup_mm)
     n_in_range = np.count_nonzero((lowest <= of_setup) & (of_setup <= highest))
-    hint = UNIT_HINT if beyond_sensor or ratio > UNIT_HINT_RATIO else ""
+    whole = np.array_equal(of_setup, np.round(of_setup), equal_nan=True)
+    hint = UNIT_HINT if beyond_sensor or whole or ratio > UNIT_HINT_RATIO else ""
     if ratio > POINT_HINT_RATIO and 2 * n_in_range > of_setup.size:
         hint = "; its decimal point may be misplaced"
     if beyond_sensor:
