@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +18,6 @@ from orthocal.text import printable
 from orthocal.units import MM, UM
 
 if TYPE_CHECKING:
-    from orthocal.effects.compensation import JointTrim
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
 
 ALTERNATIVES = ("joints.ini", "kinematics.ini")
@@ -175,7 +174,7 @@ def _read_joints(
             such an option is stated.
     """
     from orthocal.effects.compensation import JointTrim
-    from orthocal.export.linuxcnc.entered_lines import compare_joints
+    from orthocal.export.linuxcnc.entered_lines import compare_joints, require_same_homes
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     if to != "linuxcnc":
@@ -189,7 +188,7 @@ def _read_joints(
         if value is not None and in_file[option] is not None:
             raise ParameterError("is stated by --ini, too; state one of them", where=option)
     drives, stated_trims = calibration.robot.drives, calibration.session.compensation
-    _require_same_homes(calibration, joints.compensation, where=str(path))
+    require_same_homes(calibration, joints.home_offsets, where=str(path))
     expected = stated_trims or (JointTrim(),) * len(drives)
     if differences := compare_joints(zip(drives, expected, joints.compensation, strict=True)):
         raise ParameterError(
@@ -200,55 +199,21 @@ def _read_joints(
     return joints
 
 
-def _require_same_homes(
-    calibration: orthocal.Calibration, joints: Sequence[JointTrim], *, where: str
-) -> None:
-    """Refuse other HOME_OFFSET than during the measurement: offsets would be entered twice.
-
-    Args:
-        calibration: The calibration.
-        joints: Joints with the present HOME_OFFSET.
-        where: File or option, for messages.
-
-    Raises:
-        ParameterError: If it differs.
-    """
-    from orthocal.effects.compensation import home_positions
-    from orthocal.export.linuxcnc.entered_lines import compare_homes
-    from orthocal.robot.model import drive_keys
-
-    homes = home_positions(calibration.session.compensation)
-    if differences := compare_homes(calibration.robot, homes, joints):
-        keys = drive_keys("home_offset", calibration.robot.drives, homes)
-        raise ParameterError(
-            f"has other HOME_OFFSET than the session states (controller: {{{keys}}}): "
-            f"{differences}. Expected is HOME_OFFSET during the measurement, before the offsets of "
-            "this calibration were entered. If the session states it wrongly, correct it there "
-            "and calibrate again",
-            where=where,
-        )
-
-
 def _home_offsets(
     text: str | None, joints: ControllerJoints | None, calibration: orthocal.Calibration
 ) -> tuple[float, ...] | None:
     """HOME_OFFSET of each joint by the INI file or the option, [m, rad]; None without both.
 
     Raises:
-        ParameterError: If the option is malformed, or differs from what the session states.
+        ParameterError: If the option is malformed.
     """
-    from orthocal.effects.compensation import JointTrim
-
     if joints is not None and joints.home_offsets is not None:
         return joints.home_offsets
     if text is None:
         return None
     drives = calibration.robot.drives
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
-    homes = tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
-    stated = [JointTrim(home=home) for home in homes]
-    _require_same_homes(calibration, stated, where="--home-offset")
-    return homes
+    return tuple(v * d.joint_size for v, d in zip(values, drives, strict=True))
 
 
 def _latched(text: str | None, joints: ControllerJoints | None) -> tuple[int, ...] | None:

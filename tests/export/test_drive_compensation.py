@@ -561,7 +561,8 @@ def test_insignificant_change_keeps_a_table(complete, tmp_path):
     x, _, z = find_screws(under)
     assert not x.change.any()
     assert z.change.any()
-    options = replace(options, home_offsets=tuple(home_offsets(files["joints.ini"])))
+    entered = tuple(np.array(home_offsets(files["joints.ini"])) * MM)
+    options = replace(options, home_offsets=entered)
     again = export_calibration(under, "linuxcnc", anyway=True, options=options)
     assert "joint_0.comp" not in again
     assert "joint_2.comp" in again

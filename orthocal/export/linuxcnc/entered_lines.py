@@ -16,13 +16,13 @@ from orthocal.effects.compensation import (
     compensates_alike,
     home_positions,
 )
-from orthocal.errors import ExportError
+from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.drive_compensation import (
     compensate_with_offsets,
     find_active_compensation,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
-from orthocal.robot.model import Drive, Robot
+from orthocal.robot.model import Drive, Robot, drive_keys
 
 SAME_OFFSET = 0.6e-6
 """Largest difference between equal offsets, [m, rad]: they are printed to 1 µm."""
@@ -152,6 +152,32 @@ def compare_homes(robot: Robot, expected: ArrayLike | None, joints: Sequence[Joi
             if trim.home is not None and np.abs(homes - trim.home).min() > SAME_OFFSET
         ]
     )
+
+
+def require_same_homes(
+    calibration: Calibration, present: Sequence[float] | None, *, where: str
+) -> None:
+    """Refuse other HOME_OFFSET than during the measurement: offsets would be entered twice.
+
+    Args:
+        calibration: The calibration.
+        present: Present HOME_OFFSET of each joint, [m, rad]; None if unknown.
+        where: File or option, for messages.
+
+    Raises:
+        ParameterError: If it differs.
+    """
+    homes = home_positions(calibration.session.compensation)
+    joints = [JointTrim(home=home) for home in present or ()]
+    if differences := compare_homes(calibration.robot, homes, joints):
+        keys = drive_keys("home_offset", calibration.robot.drives, homes)
+        raise ParameterError(
+            f"has other HOME_OFFSET than the session states (controller: {{{keys}}}): "
+            f"{differences}. Expected is HOME_OFFSET during the measurement, before the offsets of "
+            "this calibration were entered. If the session states it wrongly, correct it there "
+            "and calibrate again",
+            where=where,
+        )
 
 
 def _either(drive: Drive, homes: Array) -> str:

@@ -21,6 +21,7 @@ from orthocal.export.linuxcnc.drive_compensation import (
     find_compensation,
     round_backlash,
 )
+from orthocal.export.linuxcnc.entered_lines import require_same_homes
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.instructions import (
     write_home_lines,
@@ -120,8 +121,10 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
 
     Raises:
         ExportError: If there is no offset to enter, or no module meets the tolerance.
-        ParameterError: If an option of a module is stated for HOME_OFFSET, or values are missing.
+        ParameterError: If an option of a module is stated for HOME_OFFSET, values are missing, or
+            HOME_OFFSET differs from what the session states.
     """
+    require_same_homes(calibration, options.home_offsets, where=OPTIONS["home_offsets"])
     before = find_active_compensation(calibration, options.latched)
     options = replace(options, home_offsets=options.home_offsets or home_positions(before))
     module = not calibration.only_offsets if options.module is None else options.module
