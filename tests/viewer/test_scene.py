@@ -374,17 +374,22 @@ def test_posture_shows_only_gauges_that_read_it():
     }
 
 
-def test_no_shape_hides_an_arrow_at_the_tool():
-    """It may be inside of the tool or of the bed."""
-    for name, visible in (("linear_delta", {"bed", "bar"}), ("raw-cycles", set())):
-        materials = {
-            c["path"].split("/")[2]: c["object"]["materials"][0]
-            for c in session_scene(name).commands
-            if c["type"] == "set_object" and c["path"].startswith(f"/{readings.BEFORE}/")
-        }
-        in_front = {n for n, m in materials.items() if m.get("depthTest") is False}
-        assert in_front == visible
-        assert all(materials[n]["transparent"] for n in in_front)  # drawn last
+def test_no_shape_hides_an_arrow_at_the_tool_or_the_line_of_a_leg_with_one_rod(root):
+    """The arrow may be inside of the tool or of the bed."""
+
+    def in_front(scene):
+        shapes = [c for c in scene.commands if c["type"] == "set_object"]
+        looks = {c["path"].strip("/"): c["object"]["materials"][0] for c in shapes}
+        nodes = {path for path, look in looks.items() if look.get("depthTest") is False}
+        assert all(looks[path]["transparent"] for path in nodes)  # drawn last
+        return {"/".join(path.split("/")[:2]) for path in nodes}
+
+    assert in_front(session_scene("raw-cycles")) == set()
+    assert in_front(session_scene("linear_delta")) == {
+        f"{readings.BEFORE}/{name}" for name in ("bed", "bar")
+    }
+    lines = {f"{machine_scene.LINES}/leg {name}" for name in ("left", "right")}
+    assert in_front(draw_scene(load_robot(root / "examples/fivebar"))) == lines
 
 
 def test_scene_states_the_offsets_to_enter(scene, calibration):
@@ -606,6 +611,16 @@ def test_robots_without_visuals_are_drawn_as_sticks(fivebar):
         pose = world(scene, f"{drawing.MACHINE}/{link}")
         assert np.abs(pose - zero[link]).max() < KINEMATICS
     assert len(scene.steps) > 3
+
+
+def test_axes_are_in_view(root):
+    """Here the origin is at one end of the machine."""
+    scene = draw_scene(load_robot(root / "examples/fivebar"))
+    names = [label.at[0] for label in scene.labels if label.node.startswith(machine_scene.AXES)]
+    assert len(names) == 3
+    points = np.array(scene.camera.points)
+    assert (points.min(axis=0) - 1e-4 <= np.min(names, axis=0)).all()
+    assert (points.max(axis=0) + 1e-4 >= np.max(names, axis=0)).all()
 
 
 def test_posture_must_be_one_of_the_session(calibration, orthoglide):
