@@ -25,6 +25,9 @@ PATIENCE = 60.0
 
 SIZES = ((1400, 900), (800, 600))
 
+NARROW = (420, 640)
+"""Size of a page on a telephone, as in a report there."""
+
 SMALL = (480, 360)
 """Size for tests that do not depend on it: pages are drawn by software, which is slow."""
 

@@ -141,7 +141,9 @@ class MachineScene:
             along = poses[leg.tip][:, :3, 3] - roots
             length = np.linalg.norm(along, axis=1)
             line = pose_along(roots, along / length[:, None])
-            self.scene.add(path, cylinder(1.0, 0.0025 * self.size), material(LINE_COLOUR))
+            # between two rods it is visible, but a single rod would hide it
+            look = material(LINE_COLOUR, in_front=len(leg.rods) < 2)
+            self.scene.add(path, cylinder(1.0, 0.0025 * self.size), look)
             self.scene.move(path, timeline.times, line)
             self.scene.place(path, line[0] @ np.diag([1.0, 1.0, length[0], 1.0]))
             scale = np.column_stack([np.ones((len(length), 2)), length])
@@ -154,14 +156,15 @@ class MachineScene:
             self.scene.explain(LegendEntry(text, (LINES,), css(LINE_COLOUR), "line"))
 
     def look_at(self, *machines: Mapping[str, Array]) -> None:
-        """Point the camera at machines and put the ground below all their frames.
+        """Point the camera at machines and the axes, and put the ground below all frames.
 
         Args:
             machines: Frame to poses of each machine, shape (F, 4, 4), [m].
         """
         corners = [self._corners(poses) for poses in machines]
         self.lower_ground(min(float(c[..., 2].min()) for c in corners))
-        points = np.concatenate([c[0] for c in corners])
+        axes = [label.at for label in self.scene.labels if label.node.startswith(f"{AXES}/")]
+        points = np.concatenate([*(c[0] for c in corners), *axes])
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         points = np.unique(np.round(points, 4), axis=0)
         self.scene.camera = Camera(to_triple(middle), VIEW, tuple(to_triple(p) for p in points))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import meshcat.geometry as g
 import numpy as np
@@ -76,13 +75,16 @@ def to_triple(point: Array) -> tuple[float, float, float]:
     return float(point[0]), float(point[1]), float(point[2])
 
 
-def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.Material:
+def material(
+    colour: Colour, *, opacity: float = 1.0, shiny: bool = False, in_front: bool = False
+) -> g.Material:
     """Material; a transparent material does not hide shapes behind it.
 
     Args:
         colour: Red, green and blue, 0 to 1.
         opacity: Opacity, 0 to 1.
         shiny: Whether the surface has highlights.
+        in_front: Whether nearer shapes do not hide it.
     """
     hexadecimal = sum(round(255 * c) << shift for c, shift in zip(colour, (16, 8, 0), strict=True))
     extra: dict[str, object] = {}
@@ -93,6 +95,8 @@ def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.
             "polygonOffsetFactor": 2.0,
             "polygonOffsetUnits": 2.0,
         }
+    if in_front:  # three.js draws transparent shapes last; only front sides, which hide the others
+        extra |= {"depthTest": False, "transparent": True, "side": 0}
     kind = g.MeshPhongMaterial if shiny else g.MeshLambertMaterial
     return kind(color=hexadecimal, opacity=opacity, **extra)
 
@@ -129,25 +133,30 @@ def draw_arrow(
     scene: Scene,
     path: str,
     pose: Array,
-    lengths: Sequence[float],
+    lengths: ArrayLike,
     *,
     width: float,
     colour: Colour,
     times: Array | None = None,
+    in_front: bool = False,
 ) -> None:
     """Draw an arrow along z of its node.
 
     Args:
         scene: The scene.
         path: Path of the node.
-        pose: Pose of the node, shape (4, 4), [m].
-        lengths: Initial length, or lengths at all times, [m]; negative against z.
+        pose: Pose of the node, shape (4, 4), or poses at all times, shape (F, 4, 4), [m].
+        lengths: Length, or lengths at all times, shape (F,), [m]; negative against z.
         width: Diameter of the shaft, [m].
         colour: Red, green and blue, 0 to 1.
-        times: Times of the lengths, shape (F,), [frames].
+        times: Times of the poses and lengths, shape (F,), [frames].
+        in_front: Whether nearer shapes do not hide it.
     """
-    look = material(colour)
-    scene.place(path, pose)
+    look = material(colour, in_front=in_front)
+    if times is None:
+        scene.place(path, pose)
+    else:
+        scene.move(path, times, pose)
     shafts, feet, heads = arrow_parts(lengths, width)
     shaft = np.diag([*shafts[0], 1.0])
     head = translation_matrix(feet[0]) @ np.diag([*heads[0], 1.0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from browser import SIZES, SMALL, open_browser, require_browser, visit
+from browser import NARROW, SIZES, SMALL, open_browser, require_browser, visit
 from calibrated import (
     EXPERIMENT_2,
     UNJUDGED,
@@ -127,7 +127,7 @@ def test_scene_draws_without_requests(drawn):
 
 
 def assert_machine_is_in_view(page, size):
-    """The complete machine is large, and beside the panel."""
+    """The complete machine is large, and beside or below the panel."""
     left, right, top, bottom = page.evaluate(
         """() => {
              const data = JSON.parse(document.getElementById('scene-data').textContent);
@@ -138,9 +138,15 @@ def assert_machine_is_in_view(page, size):
              return [Math.min(...x), Math.max(...x), Math.min(...y), Math.max(...y)];
            }"""
     )
-    panel = page.evaluate("document.getElementById('panel').getBoundingClientRect().right")
-    assert panel < left < right < size[0]
-    assert 0 < top < bottom < size[1]
+    panel, bar = page.evaluate(
+        "['panel', 'bar'].map((id) => document.getElementById(id).getBoundingClientRect().toJSON())"
+    )
+    if size == NARROW:
+        assert 0 < left < right < size[0]
+        assert panel["bottom"] < top < bottom < bar["top"]
+    else:
+        assert panel["right"] < left < right < size[0]
+        assert 0 < top < bottom < size[1]
     assert (right - left) * (bottom - top) > 0.2 * size[0] * size[1]
 
 
@@ -181,6 +187,22 @@ def test_machine_labels_and_panels_cover_nothing_at_any_size(opened, name):
         for left, top, right, bottom, text in labels:
             covered = [p for p in places if left <= p[0] <= right and top <= p[1] <= bottom]
             assert not covered, f"{text!r} covers {covered}"
+
+
+def test_legend_opens_and_closes_on_a_narrow_page(opened):
+    found = opened("calibration", lambda: scene_page(EXPERIMENT_2))
+    summary, legend = "#panel summary", "#legend"
+    found.resize(NARROW)
+    assert_machine_is_in_view(found.page, NARROW)
+    assert not found.page.is_visible(legend)
+    assert found.page.is_visible("#headline")
+    for visible in (True, False):
+        found.page.click(summary)
+        assert found.page.is_visible(legend) == visible
+    for size in SIZES:
+        found.resize(size)
+        assert found.page.is_visible(legend)
+        assert not found.page.is_visible(summary)
 
 
 def test_text_of_the_panel_fits_into_the_picture(opened):

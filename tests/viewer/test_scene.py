@@ -6,6 +6,7 @@ import re
 import shutil
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -43,7 +44,7 @@ from orthocal.output.sheet.page import sheet_files
 from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.viewer import machine as machine_scene
 from orthocal.viewer.scene import FRAME_RATE, Scene, round_scale
-from orthocal.viewer.shapes import arrow_parts, head_length
+from orthocal.viewer.shapes import arrow_parts, dial_distance, head_length
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,12 @@ def overview(full):
 def true_scale(full):
     """A posture of the complete model, not enlarged."""
     return draw_scene(full, posture="y_+60", exaggeration=1.0)
+
+
+@cache
+def session_scene(name):
+    """Scene of the session of an example, without a calibration."""
+    return draw_scene(session_of(name))
 
 
 def world(scene, path):
@@ -114,6 +121,15 @@ def dial(scene):
         if c["type"] == "set_object" and c["path"].endswith("/case")
     )
     return shape["radiusTop"]
+
+
+def hidden(scene):
+    """Nodes that are initially hidden."""
+    return {
+        c["path"].strip("/")
+        for c in scene.commands
+        if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
+    }
 
 
 def animation(scene):
@@ -307,6 +323,75 @@ def test_gauges_touch_the_leg_at_their_section(scene, calibration):
         assert stem == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
 
 
+@pytest.mark.parametrize("name", ["raw-cycles", "linear_delta"])
+def test_label_points_to_the_dial_or_fixed_ball_of_its_gauge(name):
+    session, scene = session_of(name), session_scene(name)
+    labels = [label for label in scene.labels if label.node.startswith(readings.GAUGES)]
+    assert len(labels) == len(session.setups)
+    for label in labels:
+        part = "fixed" if f"{label.node}/fixed" in scene.nodes else "case"
+        shape = world(scene, f"{label.node}/{part}")[:3, 3]
+        assert label.at[0] == pytest.approx(shape, abs=KINEMATICS)
+
+
+@pytest.mark.parametrize(
+    ("posture", "tool_mm", "read", "direction"),
+    [
+        ("bar6", (-41.782, -41.782, 10.419), "bar", (-0.6963666, -0.6963666, 0.17365)),
+        ("bed25", (70.0, 70.0, 0.0), "bed", (0.0, 0.0, -1.0)),
+    ],
+)
+def test_gauge_label_and_arrow_follow_the_tool(posture, tool_mm, read, direction):
+    """Of the bar, whose fixed ball is at the origin, and of the dial above the bed."""
+    scene, tool = session_scene("linear_delta"), np.array(tool_mm) / 1e3
+    tracks, size = animation(scene), dial(scene)
+    stop, step = next((i, s) for i, s in enumerate(scene.steps) if s.name == posture)
+
+    def value(path, name):
+        times, values = tracks[path][name]
+        return values[np.flatnonzero(np.isclose(times, step.start))[0]]
+
+    for setup in ("bar", "bed"):
+        assert value(f"{readings.GAUGES}/{setup}", "visible") == (setup == read)
+    arrow = f"{readings.BEFORE}/{read}"
+    shift = value(arrow, "position") - tool
+    assert np.linalg.norm(shift) < 1.1 * size
+    assert shift @ direction == pytest.approx(0.0, abs=1e-6)
+    if read == "bar":
+        x, y, z, w = value(arrow, "quaternion")
+        assert pin.Quaternion(w, x, y, z).toRotationMatrix()[:, 2] == pytest.approx(
+            np.array(direction), abs=1e-5
+        )
+    label = next(s for s in scene.labels if s.node == f"{readings.GAUGES}/{read}")
+    place = np.zeros(3) if read == "bar" else tool - dial_distance(size) * np.array(direction)
+    assert label.at[stop] == pytest.approx(place, abs=1e-6)
+    assert label.texts[stop].endswith(posture)
+
+
+def test_posture_shows_only_gauges_that_read_it():
+    assert hidden(draw_scene(session_of("linear_delta"), posture="bar6")) == {
+        f"{readings.GAUGES}/bed"
+    }
+
+
+def test_no_shape_hides_an_arrow_at_the_tool_or_the_line_of_a_leg_with_one_rod(root):
+    """The arrow may be inside of the tool or of the bed."""
+
+    def in_front(scene):
+        shapes = [c for c in scene.commands if c["type"] == "set_object"]
+        looks = {c["path"].strip("/"): c["object"]["materials"][0] for c in shapes}
+        nodes = {path for path, look in looks.items() if look.get("depthTest") is False}
+        assert all(looks[path]["transparent"] for path in nodes)  # drawn last
+        return {"/".join(path.split("/")[:2]) for path in nodes}
+
+    assert in_front(session_scene("raw-cycles")) == set()
+    assert in_front(session_scene("linear_delta")) == {
+        f"{readings.BEFORE}/{name}" for name in ("bed", "bar")
+    }
+    lines = {f"{machine_scene.LINES}/leg {name}" for name in ("left", "right")}
+    assert in_front(draw_scene(load_robot(root / "examples/fivebar"))) == lines
+
+
 def test_scene_states_the_offsets_to_enter(scene, calibration):
     """The leg with the largest deviation, x, is not the one with the largest offset, z."""
     fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
@@ -485,13 +570,6 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
 
 
 def test_choice_of_what_is_shown_at_first(calibration, scene):
-    def hidden(scene):
-        return {
-            c["path"].strip("/")
-            for c in scene.commands
-            if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
-        }
-
     assert hidden(scene) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNCERTAINTY}
     assert hidden(scene_of(EXPERIMENT_2, show="tool")) == {
         *(readings.GAUGES, readings.BEFORE, readings.AFTER)
@@ -533,6 +611,16 @@ def test_robots_without_visuals_are_drawn_as_sticks(fivebar):
         pose = world(scene, f"{drawing.MACHINE}/{link}")
         assert np.abs(pose - zero[link]).max() < KINEMATICS
     assert len(scene.steps) > 3
+
+
+def test_axes_are_in_view(root):
+    """Here the origin is at one end of the machine."""
+    scene = draw_scene(load_robot(root / "examples/fivebar"))
+    names = [label.at[0] for label in scene.labels if label.node.startswith(machine_scene.AXES)]
+    assert len(names) == 3
+    points = np.array(scene.camera.points)
+    assert (points.min(axis=0) - 1e-4 <= np.min(names, axis=0)).all()
+    assert (points.max(axis=0) + 1e-4 >= np.max(names, axis=0)).all()
 
 
 def test_posture_must_be_one_of_the_session(calibration, orthoglide):

@@ -92,8 +92,16 @@ class Stop:
     """Deviations of the gauges at this stop, at most one per setup."""
     place: Place | None = None
     """Measured part of the machine; None for all parts."""
+    read: frozenset[str] | None = None
+    """Setups that read this posture; None for all setups of the measured part."""
     subtracted_from: tuple[str, ...] = ()
     """Postures from whose readings the readings of this stop are subtracted."""
+
+    def has(self, setup: Setup) -> bool:
+        """Whether the gauge of a setup is at this stop; without a reading it may not touch."""
+        if self.read is None:
+            return self.place in (None, setup.sensor.place)
+        return setup.name in self.read
 
 
 def measure_deviations(session: Session) -> tuple[Deviation, ...]:
@@ -250,7 +258,8 @@ def _stop_at(
     deviations = find_worst(r for r in rows if r.posture == name)
     minuends = dict.fromkeys(r.posture for r in rows if r.minus == name)
     offsets = measured.active.get(name, measured.offsets)
-    return Stop(name, measured.drives[name], offsets, deviations, place, tuple(minuends))
+    read = frozenset(r.setup for r in rows if name in (r.posture, r.minus))
+    return Stop(name, measured.drives[name], offsets, deviations, place, read, tuple(minuends))
 
 
 def _suggest(name: str, postures: Sequence[str]) -> str:

@@ -48,6 +48,9 @@ DIAL_RADIUS = 0.034
 FIRST_ARROW, NEXT_ARROW = 0.42, 0.6
 """Distances from a contact to the first arrow and between arrows, in radii of a dial."""
 
+BAR_BALL = 0.3
+"""Radius of the balls of a bar, in radii of a dial."""
+
 MAX_FULL_SIZE = 9
 """Most gauges that are drawn in full size."""
 
@@ -91,37 +94,37 @@ def draw_readings(
         scene.arrow_scale = round_scale(LONGEST_ARROW * drawing.size / longest)
     dial = DIAL_RADIUS * drawing.size * min(1.0, math.sqrt(MAX_FULL_SIZE / max(len(setups), 1)))
     labelled = _labelled_setups(setups, measured, contacts)
-    for i, setup in enumerate(setups):
-        contact, point = contacts[setup.name], contacts[setup.name].points[0]
+    for i, (setup, contact) in enumerate(zip(setups, contacts.values(), strict=True)):
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         gauge = _draw_gauge(drawing, setup, contact, dial)
-        _move_gauge(drawing, gauge, _find_contact(drawing, setup, poses, moving=True), timeline)
-        _hide_at_others(scene, gauge, setup, stops, timeline)
+        _animate_gauge(scene, gauge, setup, contact, stops, timeline)
+        points, directions, across = _axes_at_stops(contact, timeline)
         # arrows of gauges with the same contact are drawn side by side
         others = (contacts[s.name].points[0] for s in setups[:i])
-        count = sum(float(np.linalg.norm(point - other)) < dial for other in others)
-        shift = (FIRST_ARROW + NEXT_ARROW * count) * dial * contact.along
-        tips = [point] * len(stops)
+        count = sum(float(np.linalg.norm(points[0] - other)) < dial for other in others)
+        shift = (FIRST_ARROW + NEXT_ARROW * count) * dial * across
+        tips = points
         for node in nodes:
-            foot = point + (shift if node == AFTER else -shift)
-            lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
+            feet = points + (shift if node == AFTER else -shift)
+            lengths = np.array([_deviation(row, node) * scene.arrow_scale for row in rows])
             draw_arrow(
                 scene,
                 f"{node}/{node_name(setup.name)}",
-                pose_along(foot, contact.direction),
-                np.repeat(lengths, 2).tolist(),
+                np.repeat(pose_along(feet, directions), 2, axis=0),
+                np.repeat(lengths, 2),
                 width=arrow_width(dial),
                 colour=COLOURS[node],
                 times=timeline.rests,
+                in_front=_moves(contact),
             )
-            ends = [foot + length * contact.direction for length in lengths]
-            drawing.lower_ground(min(float(end[2]) for end in ends))
+            ends = feet + lengths[:, None] * directions
+            drawing.lower_ground(float(ends[:, 2].min()))
             tips = ends if node == BEFORE else tips
         texts = ["" if row is None else _label(row, measured) for row in rows]
         if len(stops) > 1 and setup.name not in labelled:  # the first and last stop is the overview
-            texts = ["" if s is stops[0] else t for s, t in zip(stops, texts, strict=True)]
+            texts[0] = texts[-1] = ""
         rank = max(abs(r.before) for r in measured.rows if r.setup == setup.name)
-        scene.labels.append(_label_gauge(gauge, contact, dial, texts, tips, rank))
+        scene.labels.append(_label_gauge(gauge, contact, dial, texts, points, tips, rank))
     _explain(scene, nodes, shown)
     write_steps(scene, stops, timeline, _captions(measured, stops, shown))
 
@@ -155,13 +158,38 @@ def _deviation(row: Deviation | None, node: str) -> float:
     return row.before if node == BEFORE else (row.after or 0.0)
 
 
+def _moves(contact: Contact) -> bool:
+    """Whether the contact of a gauge moves with the tool; the others are fixed in space."""
+    return contact.at_tool or contact.fixed is not None
+
+
+def _stem(contact: Contact) -> Array:
+    """Unit vector from the contact to the dial of a gauge without a fixed end, shape (3,)."""
+    return -contact.direction if contact.at_tool else contact.direction
+
+
+def _axes_at_stops(contact: Contact, timeline: Timeline) -> tuple[Array, Array, Array]:
+    """Points of contact, directions of a growing reading, and directions across, at all stops.
+
+    Returns:
+        Points, [m], and unit vectors, each of shape (S, 3).
+    """
+    count = len(timeline.stops)
+    points = contact.points[timeline.stops if _moves(contact) else np.zeros(count, dtype=int)]
+    if contact.fixed is None:
+        return points, np.tile(contact.direction, (count, 1)), np.tile(contact.along, (count, 1))
+    bars = points - contact.fixed
+    directions = bars / np.linalg.norm(bars, axis=1, keepdims=True)
+    return points, directions, pose_along(points, directions)[:, :3, 0]
+
+
 def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: float) -> str:
     """Draw the gauge of a setup, and return its node."""
     node, tip = f"{GAUGES}/{node_name(setup.name)}", contact.tip
     if contact.fixed is not None:
-        draw_bar(drawing.scene, node, contact.fixed, contact.points[0], 0.3 * dial)
+        draw_bar(drawing.scene, node, contact.fixed, contact.points[0], BAR_BALL * dial)
         return node
-    stem = -contact.direction if contact.at_tool else contact.direction
+    stem = _stem(contact)
     draw_gauge(
         drawing.scene,
         node,
@@ -176,16 +204,25 @@ def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: flo
     return node
 
 
-def _move_gauge(drawing: MachineScene, node: str, contact: Contact, timeline: Timeline) -> None:
-    """Animate a gauge that moves with the tool, or a bar that rotates about its fixed end.
+def _animate_gauge(
+    scene: Scene,
+    node: str,
+    setup: Setup,
+    contact: Contact,
+    stops: Sequence[Stop],
+    timeline: Timeline,
+) -> None:
+    """Move a gauge with the tool, rotate a bar, and hide both in postures that they do not read.
 
     Args:
-        drawing: The scene of the machine.
+        scene: The scene.
         node: Node of the gauge.
+        setup: Setup of the gauge.
         contact: Contact of the gauge in all frames of the animation.
-        timeline: Times of the frames.
+        stops: The stops of the animation.
+        timeline: Times of the frames and stops.
     """
-    scene, points = drawing.scene, contact.points
+    points = contact.points
     if contact.fixed is not None:
         ends = points - contact.fixed
         lengths = np.linalg.norm(ends, axis=1)
@@ -193,15 +230,10 @@ def _move_gauge(drawing: MachineScene, node: str, contact: Contact, timeline: Ti
         scene.move(f"{node}/{BAR}", timeline.times, poses)
     elif contact.at_tool:
         scene.track(node, "position", "vector3", timeline.times, points)
-
-
-def _hide_at_others(
-    scene: Scene, gauge: str, setup: Setup, stops: Sequence[Stop], timeline: Timeline
-) -> None:
-    """Hide a gauge while another leg is measured, because its contact then moves sideways."""
-    present = np.array([s.place is None or s.place == setup.sensor.place for s in stops])
+    present = np.array([stop.has(setup) for stop in stops])
     if not present.all():
-        scene.track(gauge, "visible", "bool", timeline.times[timeline.stops], present)
+        scene.set_property(node, "visible", bool(present[0]))
+        scene.track(node, "visible", "bool", timeline.times[timeline.stops], present)
 
 
 def _label_gauge(
@@ -209,23 +241,34 @@ def _label_gauge(
     contact: Contact,
     dial: float,
     texts: Sequence[str],
-    tips: Sequence[Array],
+    points: Array,
+    tips: Array,
     rank: float,
 ) -> Label:
-    """Label of a gauge that does not cover dial, contact and tip of the arrow.
+    """Label at a dial or fixed ball that covers neither it, nor contact and tip of the arrow.
 
     Args:
         node: Node of the gauge.
         contact: Contact of the gauge.
         dial: Radius of the dial, [m].
         texts: Text at every stop.
-        tips: Tip of the arrow at every stop, shape (3,), [m].
+        points: Point of contact at every stop, shape (S, 3), [m].
+        tips: Tip of the arrow at every stop, shape (S, 3), [m].
         rank: Rank of the label.
     """
-    middle = contact.points[0] + dial_distance(dial) * contact.direction
-    rim = [middle + r * axis for axis in np.eye(3) for r in (-dial, dial)]
-    around = [tuple(map(to_triple, (contact.points[0], tip, *rim))) for tip in tips]
-    return Label((to_triple(middle),), tuple(texts), node, rank=rank, uncovered=tuple(around))
+    if contact.fixed is None:
+        middles, radius = points + dial_distance(dial) * _stem(contact), dial
+    else:
+        middles, radius = np.tile(contact.fixed, (len(points), 1)), BAR_BALL * dial
+    rims = middles[:, None] + radius * np.concatenate([np.eye(3), -np.eye(3)])
+    around = np.concatenate([points[:, None], tips[:, None], rims], axis=1)
+    return Label(
+        tuple(map(to_triple, middles)),
+        tuple(texts),
+        node,
+        rank=rank,
+        uncovered=tuple(tuple(map(to_triple, corners)) for corners in around),
+    )
 
 
 def _labelled_setups(
@@ -241,13 +284,11 @@ def _labelled_setups(
     return {row.setup for row in find_worst(find_worst(measured.rows), place_and_axis)}
 
 
-def _find_contact(
-    drawing: MachineScene, setup: Setup, poses: Mapping[str, Array], *, moving: bool = False
-) -> Contact:
-    """Contact of a sensor with the drawn machine in the first frame, or in all frames."""
+def _find_contact(drawing: MachineScene, setup: Setup, poses: Mapping[str, Array]) -> Contact:
+    """Contact of a sensor with the drawn machine in all frames."""
     frames = setup.sensor.frames(drawing.robot)
     at_zero = reference_poses(drawing.robot, frames.at_zero)
-    in_posture = [poses[f] if moving else poses[f][:1] for f in frames.in_posture]
+    in_posture = [poses[f] for f in frames.in_posture]
     return setup.sensor.contact(in_posture, at_zero, drawing.robot)
 
 

@@ -290,6 +290,12 @@ def outline(points: Array) -> Array:
     return np.asarray(points[corners])
 
 
+def _is_inside(point: Array, corners: Array) -> bool:
+    """Whether a point is inside of a convex polygon with corners as of `outline`, shape (n, 2)."""
+    sides, away = np.roll(corners, -1, axis=0) - corners, point - corners
+    return bool((sides[:, 0] * away[:, 1] > sides[:, 1] * away[:, 0]).all())
+
+
 def circle_points() -> Array:
     """24 points of the unit circle, shape (24, 2)."""
     angles = np.arange(24) * 2.0 * math.pi / 24
@@ -343,9 +349,17 @@ def draw_machine(robot: Robot, visuals: Sequence[Visual], gauge: GaugePosition) 
     looks = {joint(rod.root): ("#d6dde5", DARK) for rod in rods.values()}
     if gauge.rod is not None:
         looks[joint(gauge.rod.root)] = (TOUCHED, BLUE)
-    for visual, corners in sorted(shapes, key=lambda s: -float((s[1] @ view.forward).mean())):
-        fill, stroke = looks.get(joint(visual.link), ("#f1f2f4", "#9aa0a8"))
-        picture.polygon(outline(view.project(corners)), fill=fill, stroke=stroke)
+    shapes.sort(key=lambda s: -float((s[1] @ view.forward).mean()))
+    parts = [
+        (outline(view.project(p)), *looks.get(joint(v.link), ("#f1f2f4", "#9aa0a8")))
+        for v, p in shapes
+    ]
+    # the longest part of the touched rod; parts in front of it do not hide the place of contact
+    sizes = [np.ptp(e, axis=0).max() * (fill == TOUCHED) for e, fill, _ in parts]
+    rod, contact = int(np.argmax(sizes)), view.project(gauge.point)
+    for k, (edge, fill, stroke) in enumerate(parts):
+        hides = sizes[rod] > 0.0 and k > rod and _is_inside(contact, edge)
+        picture.polygon(edge, fill="none" if hides else fill, stroke=stroke)
     if len(surface):
         picture.polygon(view.project(surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
     _draw_tool_path(picture, view, gauge)

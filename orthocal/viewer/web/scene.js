@@ -33,6 +33,13 @@
   const panel = document.getElementById("panel");
   panel.querySelector("h1").textContent = data.title;
   panel.querySelector("#headline").textContent = data.headline;
+  // a narrow page has the panel above the machine, and its legend opens on a click
+  if (location.hash === "#picture") document.body.classList.add("picture");
+  const legend = panel.querySelector("details"), narrowQuery = window.matchMedia("(max-width: 600px)");
+  const isNarrow = () => narrowQuery.matches && location.hash !== "#picture";
+  const fold = () => (legend.open = !isNarrow());
+  narrowQuery.addEventListener("change", fold);
+  fold();
   data.facts.forEach((fact) => make("div", document.getElementById("facts"), fact));
   const marks = {
     solid: (svg, c) => makeSvg("rect", svg, { x: 4, y: 2, width: 18, height: 8, rx: 2, fill: c }),
@@ -78,7 +85,10 @@
   const fit = (again) => {
     const width = window.innerWidth, height = window.innerHeight;
     const controls = document.querySelector(".dg.main");
-    const leftSide = Math.min(panel.offsetWidth + 20, width / 2);
+    const narrow = isNarrow();
+    const leftSide = narrow ? 0 : Math.min(panel.offsetWidth + 20, width / 2);
+    const top = narrow ? panel.querySelector("summary").getBoundingClientRect().bottom : 0;
+    const bottom = narrow ? document.getElementById("bar").offsetHeight + 20 : 28;
     const rightSide = controls && controls.offsetHeight > height / 4 ? controls.offsetWidth : 0;
     const view = camera(), target = toView(data.camera.target);
     const points = data.camera.points.map((p) => toView(p).sub(target));
@@ -90,7 +100,8 @@
       const back = toView(data.camera.direction).normalize();
       const right = new THREE.Vector3(0, 1, 0).cross(back).normalize(), up = back.clone().cross(right);
       const slope = Math.tan((view.fov * Math.PI) / 360);
-      const tall = 0.86 * slope, wide = (0.94 * slope * (width - leftSide - rightSide)) / height;
+      const tall = narrow ? 0.94 * slope * Math.max(1 - (top + bottom) / height, 0.3) : 0.86 * slope;
+      const wide = (0.94 * slope * (width - leftSide - rightSide)) / height;
       // iterate: a smaller distance shifts the middle, and centring leaves room for a smaller distance
       const span = (i) => Math.max(...seen.map((p) => p[i])) - Math.min(...seen.map((p) => p[i]));
       let distance = 4 * size, seen;
@@ -104,7 +115,7 @@
       view.position.copy(back.multiplyScalar(distance).add(target));
     }
     view.aspect = width / height;
-    const x = (rightSide - leftSide) / 2 + shift[0] * height, y = -shift[1] * height + 14;
+    const x = (rightSide - leftSide) / 2 + shift[0] * height, y = -shift[1] * height + (bottom - top) / 2;
     view.setViewOffset(width, height, x, y, width, height);
     viewer.controls.update();
     viewer.set_dirty();
@@ -201,7 +212,10 @@
   // ---- bar: caption of the posture, and a button for meshcat's animator
   const bar = document.getElementById("bar");
   const button = bar.querySelector("button"), caption = bar.querySelector("span");
-  if (data.steps.length > 0) bar.style.display = "flex";
+  if (data.steps.length > 0) {
+    bar.style.display = "flex";
+    caption.textContent = data.steps[0].caption; // the view leaves room for it
+  }
   button.style.display = data.steps.length > 1 ? "" : "none";
   button.addEventListener("click", () => {
     const animator = viewer.animator;
@@ -252,7 +266,6 @@
     document.getElementById("stage").style.cssText = "";
   });
 
-  if (location.hash === "#picture") document.body.classList.add("picture");
   viewer.set_3d_pane_size();
   fit(true);
 })();

@@ -8,12 +8,14 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 from browser import open_browser, visit
+from calibrated import plan_of
 from lxml import etree
+from matplotlib.path import Path
 from scipy.spatial import ConvexHull
 
 from orthocal import load_plan
 from orthocal.output.sheet.page import sheet_files
-from orthocal.output.sheet.pictures import Picture, outline
+from orthocal.output.sheet.pictures import TOUCHED, Picture, outline
 
 ROUNDED = 0.05
 """Browsers round the extent of glyphs, [mm]."""
@@ -109,6 +111,30 @@ def test_labels_in_a_browser_are_inside_their_boxes(drawn, tmp_path):
         for (label, middle), extent in zip(placed, texts, strict=True):
             outside = np.abs(np.reshape(extent, (2, 2)) - middle) > label.half + ROUNDED
             assert not outside.any(), label.text
+
+
+def test_no_part_hides_the_place_of_contact_on_a_rod():
+    """A rail of the inclined machine is in front of the contacts of leg c."""
+    page = sheet_files(plan_of("inclined_orthoglide"))["sheet.html"]
+    svgs = [etree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+    machines = [svg for svg in svgs if svg.get("aria-label").endswith("the gauge on the machine")]
+    assert len(machines) == 6
+    transparent = []
+    for svg in machines:
+        shapes = [
+            (
+                p.get("fill"),
+                Path([[float(v) for v in q.split(",")] for q in p.get("points").split()]),
+            )
+            for p in svg.iter("{*}polygon")
+        ]
+        dot = next(c for c in svg.iter("{*}circle") if c.get("r") == "1.10")
+        contact = float(dot.get("cx")), float(dot.get("cy"))
+        sizes = [np.ptp(p.vertices, axis=0).max() * (fill == TOUCHED) for fill, p in shapes]
+        over = [fill for fill, p in shapes[np.argmax(sizes) + 1 :] if p.contains_point(contact)]
+        assert set(over) <= {"none"}
+        transparent.append(len(over))
+    assert transparent == [0, 0, 0, 0, 1, 1]
 
 
 def test_a_label_keeps_off_lines_and_stays_near_its_point():
