@@ -17,6 +17,7 @@ from orthocal.assessment.circular_deviation import Circle
 from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.residual_rows import (
+    largest_first,
     root_mean_square,
     rows_by_setup,
 )
@@ -53,12 +54,13 @@ MAX_POINTS = 500
 
 @plot("residuals")
 def plot_residuals(calibration: Calibration) -> Figure:
-    """Deviations of the readings before and after calibration, the worst first."""
+    """Deviations of the readings before and after calibration, the largest residual first."""
     residuals = calibration.residuals
-    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:MAX_ROWS]
-    title = "Readings before and after calibration, the worst first"
+    rows = largest_first(residuals)[:MAX_ROWS]
+    title = "Readings before and after calibration, the largest residual first"
     if len(rows) < len(residuals):
-        title = f"Readings before and after calibration: the {len(rows)} worst of {len(residuals)}"
+        largest = f"the {len(rows)} largest residuals of {len(residuals)}"
+        title = f"Readings before and after calibration: {largest}"
     repeated = any(r.cycle != 1 for r in residuals)
     names = [f"{r.label}, cycle {r.cycle}" if repeated else r.label for r in rows]
     figure, axes = open_list(title, names)
