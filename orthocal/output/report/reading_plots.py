@@ -33,6 +33,7 @@ from orthocal.output.report.figure import (
     open_figure,
     open_list,
     plot,
+    round_up,
     scale_log,
     shade,
 )
@@ -193,7 +194,7 @@ def plot_circle(circle: Circle) -> Figure:
             closed, radii, mark if few else "-", color=colour, label=text, markersize=3.0, lw=1.0
         )
     largest = max(float(np.abs([circle.before, circle.after]).max()) / UM, 1e-3)
-    step = _round_up(largest)
+    step = round_up(largest)
     axes.set_ylim(-2.0 * step, step)
     axes.set_yticks([-step, 0.0, step], [f"−{step:g} µm", "0", f"+{step:g} µm"])
     axes.set_rlabel_position(67.5)
@@ -202,11 +203,3 @@ def plot_circle(circle: Circle) -> Figure:
     axes.set_xticks(np.pi / 2.0 * np.arange(4), names)
     draw_legend(figure, axes)
     return figure
-
-
-def _round_up(value: float) -> float:
-    """Smallest number of the form 1, 2 or 5 times a power of ten that is not less."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(
-        next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * (1.0 - 1e-9))
-    )

@@ -230,6 +230,32 @@ def test_long_names_remain_distinct_and_leave_space_for_the_plot(table1):
     assert max(map(len, row_names(figure.axes[0]))) == layout.LONGEST_NAME
 
 
+def test_intervals_of_the_bootstrap_are_named_with_the_number_of_parameters():
+    scatter = [
+        Scatter(SimpleNamespace(name=f"p{i}"), 0.0, MM, MM, -MM, MM, MM, MM) for i in range(41)
+    ]
+    figure = study_plots.plot_bootstrap.figure(BootstrapSummary(10, MM, tuple(scatter), None))
+    (axes,) = figure.axes
+    assert title(figure).endswith("the first 40 of 41 parameters")
+    assert axes.get_xlabel() == "draw − estimate [predicted standard deviation]"
+    assert axes.get_legend_handles_labels()[1] == [
+        *("predicted interval", "95 % of the draws", "estimate")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("largest", "ends"), [(4.1, [0.1, 1.0, 5.0]), (2.0, [0.1, 2.0]), (0.6, [0.01, 0.1, 1.0])]
+)
+def test_colours_of_sensitivities_have_a_scale_with_name_and_ends(largest, ends):
+    changes = np.array([[largest, -0.3]]) * MM
+    summary = SensitivitySummary((("zero", "yx"),), ("a", "b"), ("mm/mm",) * 2, changes, changes)
+    bar = study_plots.plot_sensitivity.figure(summary).axes[1]
+    assert bar.get_ylabel() == f"change [µm], logarithmic beyond ±{ends[0] * 1e3:g}"
+    ticks = np.array([*-np.array(ends)[::-1], 0.0, *ends]) * 1e3
+    np.testing.assert_allclose(np.sort(bar.get_yticks()), ticks)
+    np.testing.assert_allclose(bar.get_ylim(), ticks[[0, -1]])
+
+
 def test_tool_errors_of_exact_machines_and_their_prediction_are_on_the_axis():
     table = SimpleNamespace(columns={"before_um": [0.0, 0.0], "tool_um": [3.0, np.nan]})
     (axes,) = study_plots.plot_machines.figure(table, 70.0).axes
