@@ -17,9 +17,11 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BAND,
     BEFORE,
+    BEFORE_LOOK,
     CHARACTER,
     MAX_NAME_IN_MATRIX,
     PREDICTED,
+    PREDICTED_LOOK,
     Look,
     Plot,
     count_of,
@@ -49,6 +51,13 @@ SMALLEST_DRAWN_UM = 1e-3
 
 MAX_ERRORS = 40
 """Largest number of errors in a plot."""
+
+_OPEN: Look = {"markerfacecolor": "none", "markeredgewidth": 1.4}
+USUAL_LOOKS: tuple[Look, ...] = (
+    {**BEFORE_LOOK, **_OPEN, "markersize": 12.0},
+    {**PREDICTED_LOOK, **_OPEN, "markersize": 9.0},
+)
+"""Looks of the usual plans beside a plan, which remain visible around it and each other."""
 
 NORMAL_95 = 1.96
 """Half width of the 95 % interval of a normal distribution, [σ]."""
@@ -182,12 +191,13 @@ PLOTS: dict[str, Plot[...]] = {
 
 
 @plot("plan")
-def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
+def plot_plan(plan: MeasuringPlan, unit: float, when: str) -> Figure:
     """Expected tool error over measuring time.
 
     Args:
         plan: The plan.
         unit: Unit of its criterion, [m] for a tool error, otherwise 1.
+        when: Measurement after which the tool error is expected.
     """
     quantity = "Expected error" if unit == UM else "Criterion"
     figure = open_figure(3.2, f"{quantity} over measuring time")
@@ -196,19 +206,19 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
     hours, errors = [s.minutes / HOUR for s in stages], [s.error / unit for s in stages]
     axes.plot(hours, errors, ".-", color=AFTER, label="setups added one by one")
     errors.append(plan.stage.error / unit)
-    axes.plot(plan.minutes / HOUR, errors[-1], "s", color=AFTER, label="this plan")
+    axes.plot(plan.minutes / HOUR, errors[-1], label="this plan", **AFTER_LOOK)
     if plan.criterion == "aligned":
-        for marker, colour, other in zip("o^", (BEFORE, PREDICTED), plan.usual_plans, strict=False):
+        for look, other in zip(USUAL_LOOKS, plan.usual_plans, strict=False):
             if other.expected is not None:
                 errors.append(other.expected.reported.rms / unit)
-                look: Look = {"color": colour, "label": other.name}
-                axes.plot(other.minutes / HOUR, errors[-1], marker, **look)
+                axes.plot(other.minutes / HOUR, errors[-1], label=other.name, **look)
     if plan.enough is not None:
         label = f"another hour gains < {HOURLY_GAIN:.0%}"
         axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
     scale_log(axes, "y", np.array(errors))
     axes.set_xlim(left=0.0)
-    _finish(figure, axes, "time [h]", "expected tool error [µm]" if unit == UM else "criterion")
+    error = f"expected tool error [µm]{when}" if unit == UM else "criterion"
+    _finish(figure, axes, "time [h]", error)
     return figure
 
 
