@@ -16,7 +16,8 @@ def main() -> None:
     calibration = calibrate(load_session(ROOT / "examples/table1/experiment-2"))
     scene = draw_scene(calibration).to_html()
     take_picture(scene, ROOT / "docs/scene.png", width=1080, height=720)
-    take_picture(build_report(calibration), ROOT / "docs/report.png", width=960, height=1240)
+    report = build_report(calibration, saved=Path("/home/user/out/experiment-2"))
+    take_picture(report, ROOT / "docs/report.png", width=960, height=1240)
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ class Comparison:
         """Usual plans with the same numbers of setups and readings as the plan.
 
         The paper's plan reads each leg at its middle in both directions, in the mechanical zero and
-        at both ends of the travel, repeatedly. The even plan has evenly spaced postures on the same
+        at both ends of the travel, repeatedly. The other has evenly spaced postures on the same
         lines. Each setup ends with its first posture.
         """
         setups = self._middle_setups()
@@ -88,7 +88,7 @@ class Comparison:
         counts = [total // count + (i < total % count) for i in range(count)]
         lines = [self._line(setup) for setup in chosen]
         plans = []
-        for name, select in (("the paper's", _ends_and_zero), ("even", _evenly)):
+        for name, select in (("the paper's", _ends_and_zero), ("evenly spaced", _evenly)):
             rows = [select(*line, n - 1) for line, n in zip(lines, counts, strict=True)]
             if any(len(indices) < MIN_READINGS for indices in rows):
                 continue

@@ -52,3 +52,13 @@ def test_a_wide_table_is_printed_row_by_row():
         "  interval: -1.759 … +0.705",
         "  unit: mm",
     ]
+
+
+def test_words_are_cut_only_where_the_table_does_not_fit_otherwise():
+    row = ("frame.x_rod_b_tip.x", "ball on the leg", "+0.003")
+    table = table_of(("parameter", "gauge", "value [mm]"), [row], left=2)
+    for width, is_whole in ((80, True), (40, True), (36, True), (35, False)):
+        text = to_text(table, width=width)
+        assert max(map(len, text.splitlines())) <= width
+        assert set(row[1].split()) <= set(text.split())
+        assert (row[0] in text.split()) == is_whole, width

@@ -37,7 +37,8 @@ from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import cube
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
-from orthocal.output.text.plan import plan_json
+from orthocal.output.report.study_plots import plot_plan
+from orthocal.output.text.plan import draw_plan, plan_json
 from orthocal.planning import plan as planning
 from orthocal.planning.candidates import list_candidates, measure_candidates, share_columns
 from orthocal.planning.cost_curve import compute_curve, find_enough
@@ -51,6 +52,7 @@ from orthocal.planning.timed_search import TimedSearch
 from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
+from orthocal.units import UM
 
 OFFSETS = {"*.offset_mm": 4.0}
 DIAL = Gauge(5e-6, None, (-5e-3, 5e-3))
@@ -114,10 +116,20 @@ def test_setups_share_columns_and_parts_of_an_instrument_do_not():
 
 def test_no_usual_plan_is_better_at_equal_cost(planned):
     names = [a.name for a in planned.usual_plans]
-    assert names == ["the paper's", "even"]
+    assert names == ["the paper's", "evenly spaced"]
     for usual in planned.usual_plans:
         assert usual.minutes == pytest.approx(planned.minutes)
         assert not is_less(usual.expected.reported.rms, planned.expected.reported.rms)
+
+
+def test_the_picture_of_a_plan_states_when_errors_are_expected_and_shows_all_plans(planned):
+    assert "after a second measurement" in draw_plan(planned)
+    assert "second measurement" not in draw_plan(replace(planned, complements_session=True))
+    (axes,) = plot_plan.figure(planned, UM, "").axes
+    looks = {line.get_label(): line for line in axes.lines}
+    papers, even, this = (looks[n] for n in ("the paper's", "evenly spaced", "this plan"))
+    assert papers.get_markerfacecolor() == even.get_markerfacecolor() == "none"
+    assert papers.get_markersize() > 1.3 * even.get_markersize() > 1.6 * this.get_markersize()
 
 
 def assert_machines_have_the_expected_error(plan, *, machines):
@@ -368,7 +380,7 @@ def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide
         plan = plan_readings(orthoglide, choice, equipment=equipment, starts=1)
     assert [(a.name, a.expected) for a in plan.usual_plans] == [
         ("the paper's", None),
-        ("even", None),
+        ("evenly spaced", None),
     ]
     assert summarize(plan).count("beyond the dial's range") == 2
     compared = json.loads(plan_json(plan))["usual_plans"]

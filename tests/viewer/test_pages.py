@@ -310,9 +310,16 @@ def test_report_opens_without_requests_and_prints(report, tmp_path):
     assert report.messages == []
     outside = [u for u in report.requests if not u.startswith(("about:", "data:"))]
     assert outside == [report.page.url]
+    width = "document.querySelector('iframe').clientWidth"
+    drawn = report.page.evaluate(width)
+    handle.evaluate(
+        "addEventListener('beforeprint', () => (top.printed = frameElement.style.width))"
+    )
     data = report.page.pdf(path=str(tmp_path / "report.pdf"), format="A4", print_background=True)
     assert data.startswith(b"%PDF")
     assert data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") >= 3
+    assert report.page.evaluate("printed") == f"{drawn}px"  # the scene is not cut on paper
+    assert report.page.evaluate(width) == drawn
 
     # ---- pictures
 

@@ -75,6 +75,11 @@ def rows_by_setup(rows: Iterable[ResidualRow]) -> dict[str, list[ResidualRow]]:
     return groups
 
 
+def largest_first(rows: Iterable[ResidualRow]) -> list[ResidualRow]:
+    """Rows sorted by the size of their residuals."""
+    return sorted(rows, key=lambda row: -abs(row.residual))
+
+
 def root_mean_square(values: Iterable[float]) -> float:
     """RMS of the finite values; NaN if there are none."""
     finite = [v for v in values if math.isfinite(v)]

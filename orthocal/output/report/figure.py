@@ -259,6 +259,12 @@ def scale_log(axes: Axes, side: Literal["x", "y"], values: Array) -> None:
     axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
 
 
+def round_up(value: float) -> float:
+    """Smallest number of the form 1, 2 or 5 times a power of ten that is not less."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * (1.0 - 1e-9))
+
+
 def count_of(shown: int, count: int) -> str:
     """Number of shown items, and number of all items if some are not shown."""
     return str(count) if shown == count else f"{shown} of {count}"

@@ -210,8 +210,9 @@ def _fit(calibration: Calibration) -> str:
     """Content of the section with the residuals."""
     parts = [to_markup(render_fit(calibration))]
     text = (
-        "Predicted: readings of each setup, predicted from all other setups. A good model predicts "
-        "them nearly as well as it fits them."
+        "Predicted: readings of each setup, predicted from all other setups. Predictions nearly as "
+        "close as the fit confirm the model. Larger errors do not refute it: a setup may measure "
+        "errors of the machine that no other setup measures."
     )
     if all(math.isnan(r.prediction_error) for r in calibration.residuals):
         text = "No setup can be predicted: the other setups do not determine the model."

@@ -17,6 +17,7 @@ from orthocal.assessment.circular_deviation import Circle
 from orthocal.assessment.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.residual_rows import (
+    largest_first,
     root_mean_square,
     rows_by_setup,
 )
@@ -32,6 +33,7 @@ from orthocal.output.report.figure import (
     open_figure,
     open_list,
     plot,
+    round_up,
     scale_log,
     shade,
 )
@@ -53,12 +55,13 @@ MAX_POINTS = 500
 
 @plot("residuals")
 def plot_residuals(calibration: Calibration) -> Figure:
-    """Deviations of the readings before and after calibration, the worst first."""
+    """Deviations of the readings before and after calibration, the largest residual first."""
     residuals = calibration.residuals
-    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:MAX_ROWS]
-    title = "Readings before and after calibration, the worst first"
+    rows = largest_first(residuals)[:MAX_ROWS]
+    title = "Readings before and after calibration, the largest residual first"
     if len(rows) < len(residuals):
-        title = f"Readings before and after calibration: the {len(rows)} worst of {len(residuals)}"
+        largest = f"the {len(rows)} largest residuals of {len(residuals)}"
+        title = f"Readings before and after calibration: {largest}"
     repeated = any(r.cycle != 1 for r in residuals)
     names = [f"{r.label}, cycle {r.cycle}" if repeated else r.label for r in rows]
     figure, axes = open_list(title, names)
@@ -191,7 +194,7 @@ def plot_circle(circle: Circle) -> Figure:
             closed, radii, mark if few else "-", color=colour, label=text, markersize=3.0, lw=1.0
         )
     largest = max(float(np.abs([circle.before, circle.after]).max()) / UM, 1e-3)
-    step = _round_up(largest)
+    step = round_up(largest)
     axes.set_ylim(-2.0 * step, step)
     axes.set_yticks([-step, 0.0, step], [f"−{step:g} µm", "0", f"+{step:g} µm"])
     axes.set_rlabel_position(67.5)
@@ -200,11 +203,3 @@ def plot_circle(circle: Circle) -> Figure:
     axes.set_xticks(np.pi / 2.0 * np.arange(4), names)
     draw_legend(figure, axes)
     return figure
-
-
-def _round_up(value: float) -> float:
-    """Smallest number of the form 1, 2 or 5 times a power of ten that is not less."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(
-        next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * (1.0 - 1e-9))
-    )

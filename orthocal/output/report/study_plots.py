@@ -17,9 +17,11 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BAND,
     BEFORE,
+    BEFORE_LOOK,
     CHARACTER,
     MAX_NAME_IN_MATRIX,
     PREDICTED,
+    PREDICTED_LOOK,
     Look,
     Plot,
     count_of,
@@ -27,6 +29,7 @@ from orthocal.output.report.figure import (
     open_figure,
     open_list,
     plot,
+    round_up,
     scale_log,
 )
 from orthocal.output.text.layout import short_names, true_minus
@@ -48,6 +51,13 @@ SMALLEST_DRAWN_UM = 1e-3
 
 MAX_ERRORS = 40
 """Largest number of errors in a plot."""
+
+_OPEN: Look = {"markerfacecolor": "none", "markeredgewidth": 1.4}
+USUAL_LOOKS: tuple[Look, ...] = (
+    {**BEFORE_LOOK, **_OPEN, "markersize": 12.0},
+    {**PREDICTED_LOOK, **_OPEN, "markersize": 9.0},
+)
+"""Looks of the usual plans beside a plan, which remain visible around it and each other."""
 
 NORMAL_95 = 1.96
 """Half width of the 95 % interval of a normal distribution, [σ]."""
@@ -125,39 +135,48 @@ def plot_bootstrap(s: BootstrapSummary) -> Figure:
     low, high = (
         np.array([getattr(p, end) - p.estimate for p in shown]) / unit for end in ("low", "high")
     )
-    title = "Intervals of 95 % of the draws, in predicted standard deviations"
+    title = "Intervals with 95 % of the draws"
+    if len(shown) < len(s.parameters):
+        title += f": the first {len(shown)} of {len(s.parameters)} parameters"
     figure, axes = open_list(title, [p.parameter.name for p in shown])
     y = np.arange(len(shown))
-    axes.axvspan(-NORMAL_95, NORMAL_95, color=BAND, label="predicted")
-    axes.hlines(y, low, high, color=AFTER)
+    axes.axvspan(-NORMAL_95, NORMAL_95, color=BAND, label="predicted interval")
+    axes.hlines(y, low, high, color=AFTER, label="95 % of the draws")
     axes.plot(0.0 * y, y, label="estimate", **AFTER_LOOK)
+    axes.set_xlabel("draw − estimate [predicted standard deviation]")
     draw_legend(figure, axes)
     return figure
 
 
 @plot("study")
 def plot_sensitivity(s: SensitivitySummary) -> Figure:
-    """Heat map of the change of each reading and tool coordinate by each error."""
+    """Heat map of the change of each reading and tool coordinate by each error.
+
+    Colours are logarithmic beyond a linear range around zero.
+    """
     by_influence = np.argsort(-np.abs(s.per_prior_std).max(axis=0), kind="stable")
     chosen = np.sort(by_influence[:MAX_ERRORS])
     number = count_of(len(chosen), len(s.parameters))
     values = s.per_prior_std[:, chosen] / UM
     largest = max(float(np.abs(values).max()), 1e-9)
     decades = 10.0 ** np.arange(math.floor(math.log10(largest)) - 1, math.ceil(math.log10(largest)))
-    title = f"Change by one prior standard deviation of each error [µm], {number} errors"
+    limit, linear = round_up(largest), float(decades[0])
+    title = f"Change by one prior standard deviation of each error, {number} errors"
     columns = short_names([s.parameters[i] for i in chosen], MAX_NAME_IN_MATRIX)
     below = CHARACTER * max(map(len, columns))
     figure = open_figure(0.2 + 0.16 * len(s.rows) + below, title, legend=False)
     axes = figure.subplots()
-    norm = SymLogNorm(linthresh=decades[0], vmin=-largest, vmax=largest)
+    norm = SymLogNorm(linthresh=linear, vmin=-limit, vmax=limit)
     look: dict[str, Any] = {"aspect": "auto", "cmap": "RdBu_r", "interpolation": "nearest"}
     image = axes.imshow(values, norm=norm, **look)
     rows = short_names([f"{posture}  {output}" for posture, output in s.rows])
     axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
     axes.set_xticks(range(len(columns)), columns, fontsize=6.5, rotation=90)
-    ticks = FixedLocator([*-decades[::-1], 0.0, *decades])
+    sizes = np.append(decades[decades < 0.4 * limit], limit)  # labels do not overlap
+    ticks = FixedLocator([*-sizes, 0.0, *sizes])
     text = FuncFormatter(lambda v, _: true_minus(f"{v:+g}") if v else "0")
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, ticks=ticks, format=text)
+    label = f"change [µm], logarithmic beyond ±{linear:g}"
+    bar = figure.colorbar(image, ax=axes, fraction=0.04, ticks=ticks, format=text, label=label)
     bar.minorticks_off()
     return figure
 
@@ -172,12 +191,13 @@ PLOTS: dict[str, Plot[...]] = {
 
 
 @plot("plan")
-def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
+def plot_plan(plan: MeasuringPlan, unit: float, when: str) -> Figure:
     """Expected tool error over measuring time.
 
     Args:
         plan: The plan.
         unit: Unit of its criterion, [m] for a tool error, otherwise 1.
+        when: Measurement after which the tool error is expected.
     """
     quantity = "Expected error" if unit == UM else "Criterion"
     figure = open_figure(3.2, f"{quantity} over measuring time")
@@ -186,19 +206,19 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
     hours, errors = [s.minutes / HOUR for s in stages], [s.error / unit for s in stages]
     axes.plot(hours, errors, ".-", color=AFTER, label="setups added one by one")
     errors.append(plan.stage.error / unit)
-    axes.plot(plan.minutes / HOUR, errors[-1], "s", color=AFTER, label="this plan")
+    axes.plot(plan.minutes / HOUR, errors[-1], label="this plan", **AFTER_LOOK)
     if plan.criterion == "aligned":
-        for marker, colour, other in zip("o^", (BEFORE, PREDICTED), plan.usual_plans, strict=False):
+        for look, other in zip(USUAL_LOOKS, plan.usual_plans, strict=False):
             if other.expected is not None:
                 errors.append(other.expected.reported.rms / unit)
-                look: Look = {"color": colour, "label": other.name}
-                axes.plot(other.minutes / HOUR, errors[-1], marker, **look)
+                axes.plot(other.minutes / HOUR, errors[-1], label=other.name, **look)
     if plan.enough is not None:
         label = f"another hour gains < {HOURLY_GAIN:.0%}"
         axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
     scale_log(axes, "y", np.array(errors))
     axes.set_xlim(left=0.0)
-    _finish(figure, axes, "time [h]", "expected tool error [µm]" if unit == UM else "criterion")
+    error = f"expected tool error [µm]{when}" if unit == UM else "criterion"
+    _finish(figure, axes, "time [h]", error)
     return figure
 
 

@@ -53,7 +53,7 @@ BULLET = "• "
 """Start of an item of a list."""
 
 SHORTEST_WORD = 12
-"""Columns that a column of words keeps when a table gets narrow; longer words are broken then."""
+"""Columns that a column of words keeps in a narrow console, where longer words are cut."""
 
 GAP = 3
 """Columns between those of a table."""
@@ -63,15 +63,22 @@ TIGHT_GAP = 1
 
 
 class NumberTable(Table):
-    """A table whose numbers are never cut: where it is too wide each row becomes a paragraph."""
+    """A table whose numbers are never cut: where it is too wide each row becomes a paragraph.
+
+    Words are not cut either, unless a table with narrower columns of words still fits.
+    """
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Render the table, or each row as a paragraph (rich's protocol)."""
-        for gap, padding in ((GAP, (0, 1)), (TIGHT_GAP, (0, 0))):
-            if self._least_width(gap) <= options.max_width:
-                self.padding = padding
-                yield from super().__rich_console__(console, options)
-                return
+        for longest in (LONGEST_NAME, SHORTEST_WORD):
+            for gap, padding in ((GAP, (0, 1)), (TIGHT_GAP, (0, 0))):
+                widths = self._fit(options.max_width - gap * (len(self.columns) - 1), longest)
+                if widths is not None:
+                    self.padding = padding
+                    for column, width in zip(self.columns, widths, strict=True):
+                        column.width = width
+                    yield from super().__rich_console__(console, options)
+                    return
         lead = max(1, next((i for i, c in enumerate(self.columns) if c.no_wrap), 1))
         cells = [[_plain(cell) for cell in column.cells] for column in self.columns]
         headers = [_plain(column.header) for column in self.columns]
@@ -86,17 +93,28 @@ class NumberTable(Table):
         """Measure the table; it may be as narrow as its paragraphs (rich's protocol)."""
         return super().__rich_measure__(console, options).with_maximum(options.max_width)
 
-    def _least_width(self, gap: int) -> int:
-        """Columns of the console below which a number would be cut."""
-        least = gap * (len(self.columns) - 1)
+    def _fit(self, available: int, longest: int) -> list[int] | None:
+        """Widths of the columns, of which those with words are narrowed, the widest first.
+
+        Args:
+            available: Columns of the console without gaps.
+            longest: Columns of the longest word that is not cut.
+
+        Returns:
+            The widths; None if a number or such a word would be cut.
+        """
+        widths, least = [], []
         for column in self.columns:
             texts = [_plain(column.header), *(_plain(cell) for cell in column.cells)]
-            if column.no_wrap:
-                least += max(cell_len(text) for text in texts)
-            else:
-                words = [cell_len(word) for text in texts for word in text.split()]
-                least += min(max(words, default=0), SHORTEST_WORD)
-        return least
+            widths.append(max(map(cell_len, texts)))
+            words = (cell_len(word) for text in texts for word in text.split())
+            least.append(widths[-1] if column.no_wrap else min(max(words, default=0), longest))
+        if sum(least) > available:
+            return None
+        for _ in range(sum(widths) - available):
+            wide = [i for i, width in enumerate(widths) if width > least[i]]
+            widths[max(wide, key=widths.__getitem__)] -= 1
+        return widths
 
 
 def to_text(content: RenderableType, *, width: int = WIDTH) -> str:

@@ -371,7 +371,7 @@ def draw_plan(plan: MeasuringPlan) -> str:
     """Expected error over measuring time, as an SVG file."""
     from orthocal.output.report.study_plots import plot_plan
 
-    return plot_plan.document(plan, _unit(plan))
+    return plot_plan.document(plan, _unit(plan), _second_measurement(plan, "\nafter "))
 
 
 def show_duration(minutes: float) -> str:
@@ -421,8 +421,7 @@ def _alternatives(plan: MeasuringPlan) -> RenderableType:
         error = "beyond the dial's range"
         if a.expected is not None:
             error = um(a.expected.reported.rms)
-        name = "evenly spaced" if a.name == "even" else a.name
-        rows.append((name, str(a.setups), str(a.readings), show_duration(a.minutes), error))
+        rows.append((a.name, str(a.setups), str(a.readings), show_duration(a.minutes), error))
     headers = ("plan", "setups", "readings", "time", "tool error [µm]")
     return table_of(headers, rows)
 

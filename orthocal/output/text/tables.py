@@ -17,7 +17,7 @@ from orthocal.calibration.assessment_record import FindingKind
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.calibration.refit import restore_session
-from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow, largest_first
 from orthocal.observation.sensor_groups import nominal_values
 from orthocal.output.text.answer import name_values
 from orthocal.output.text.layout import (
@@ -208,7 +208,7 @@ def render_readings(
     """Readings before and after calibration, the worst of many or all."""
     residuals = calibration.residuals
     if worst_first:
-        residuals = tuple(sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual))))
+        residuals = tuple(largest_first(residuals))
     notes = [
         "before, after: measured less nominal, measured less calibrated",
         "studentised: deviation from the prediction by all other readings, in its σ; influence: "

@@ -255,15 +255,17 @@
     const image = document.getElementById("print-image") || make("img", stage);
     image.id = "print-image";
     image.src = viewer.capture_image();
-    // keep the size of the window on paper
+    // keep the size of the window on paper, also in the frame of a page
     for (const element of [stage, image]) {
       element.style.width = `${window.innerWidth}px`;
       element.style.height = `${window.innerHeight}px`;
     }
+    if (window.frameElement) window.frameElement.style.width = `${window.innerWidth}px`;
   });
   window.addEventListener("afterprint", () => {
     document.getElementById("print-image").remove();
     document.getElementById("stage").style.cssText = "";
+    if (window.frameElement) window.frameElement.style.width = "100%";
   });
 
   viewer.set_3d_pane_size();

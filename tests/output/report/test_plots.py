@@ -105,8 +105,8 @@ def drawn(table1, unknown):
 
 
 def worst(row):
-    """Sorts the largest deviation, before or after, to the front."""
-    return -max(abs(row.deviation), abs(row.residual))
+    """Sorts the largest residual to the front."""
+    return -abs(row.measured - row.predicted)
 
 
 def line(axes, label):
@@ -230,6 +230,32 @@ def test_long_names_remain_distinct_and_leave_space_for_the_plot(table1):
     assert max(map(len, row_names(figure.axes[0]))) == layout.LONGEST_NAME
 
 
+def test_intervals_of_the_bootstrap_are_named_with_the_number_of_parameters():
+    scatter = [
+        Scatter(SimpleNamespace(name=f"p{i}"), 0.0, MM, MM, -MM, MM, MM, MM) for i in range(41)
+    ]
+    figure = study_plots.plot_bootstrap.figure(BootstrapSummary(10, MM, tuple(scatter), None))
+    (axes,) = figure.axes
+    assert title(figure).endswith("the first 40 of 41 parameters")
+    assert axes.get_xlabel() == "draw − estimate [predicted standard deviation]"
+    assert axes.get_legend_handles_labels()[1] == [
+        *("predicted interval", "95 % of the draws", "estimate")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("largest", "ends"), [(4.1, [0.1, 1.0, 5.0]), (2.0, [0.1, 2.0]), (0.6, [0.01, 0.1, 1.0])]
+)
+def test_colours_of_sensitivities_have_a_scale_with_name_and_ends(largest, ends):
+    changes = np.array([[largest, -0.3]]) * MM
+    summary = SensitivitySummary((("zero", "yx"),), ("a", "b"), ("mm/mm",) * 2, changes, changes)
+    bar = study_plots.plot_sensitivity.figure(summary).axes[1]
+    assert bar.get_ylabel() == f"change [µm], logarithmic beyond ±{ends[0] * 1e3:g}"
+    ticks = np.array([*-np.array(ends)[::-1], 0.0, *ends]) * 1e3
+    np.testing.assert_allclose(np.sort(bar.get_yticks()), ticks)
+    np.testing.assert_allclose(bar.get_ylim(), ticks[[0, -1]])
+
+
 def test_tool_errors_of_exact_machines_and_their_prediction_are_on_the_axis():
     table = SimpleNamespace(columns={"before_um": [0.0, 0.0], "tool_um": [3.0, np.nan]})
     (axes,) = study_plots.plot_machines.figure(table, 70.0).axes
@@ -239,12 +265,12 @@ def test_tool_errors_of_exact_machines_and_their_prediction_are_on_the_axis():
     assert axes.get_ylim()[0] == 0.0
 
 
-def test_residuals_are_listed_before_and_after_the_worst_first(table1):
+def test_readings_are_listed_before_and_after_the_largest_residual_first(table1):
     figure = reading_plots.plot_residuals.figure(table1)
     axes = figure.axes[0]
-    rows = sorted(table1.residuals, key=lambda r: -abs(r.measured - r.nominal))
+    rows = sorted(table1.residuals, key=worst)
     assert row_names(axes) == [r.label for r in rows]
-    assert row_names(axes)[0] == "zx x_max − x_min"
+    assert row_names(axes)[0] == "xy y_max − y_min"
     bottom, top = axes.get_ylim()
     assert bottom > top  # the first row is the highest
     for label, values in (
@@ -266,7 +292,7 @@ def test_markers_in_the_file_are_where_the_deviations_are(table1):
     assert len(found) == 7  # six readings, and one in the legend
     by_height = sorted(found, key=lambda e: float(e.get("y")))[1:]
     place = np.array([float(e.get("x")) for e in by_height])
-    values = sorted((r.deviation for r in table1.residuals), key=lambda v: -abs(v))
+    values = [r.deviation for r in sorted(table1.residuals, key=worst)]
     slope, start = np.polyfit(values, place, 1)
     assert slope > 0.0
     assert np.abs(start + slope * np.array(values) - place).max() < PLACE
@@ -289,19 +315,24 @@ def test_the_band_is_two_sigma_of_each_row(table1):
 
 def test_of_many_readings_the_largest_are_shown_with_a_note(sweep):
     figure = reading_plots.plot_residuals.figure(sweep)
-    assert title(figure) == "Readings before and after calibration: the 40 worst of 162"
+    assert title(figure) == "Readings before and after calibration: the 40 largest residuals of 162"
     x, _ = line(figure.axes[0], "before")
     rows = sorted(sweep.residuals, key=worst)[:40]
     np.testing.assert_allclose(x, [r.deviation * 1e3 for r in rows], atol=UNIT)
 
 
-def test_a_reading_that_the_calibration_spoils_is_among_the_worst(table1):
-    best = min(table1.residuals, key=lambda r: abs(r.deviation))
-    spoilt = replace(best, predicted=best.measured - 3e-3)
-    rows = tuple(spoilt if r is best else r for r in table1.residuals)
-    figure = reading_plots.plot_residuals.figure(replace(table1, residuals=rows))
-    x, _ = line(figure.axes[0], "after")
-    np.testing.assert_allclose(x[0], 3.0, atol=UNIT)
+def test_a_wrong_reading_comes_first_although_the_machine_deviated_more_before(sweep):
+    best = min(sweep.residuals, key=lambda r: abs(r.deviation))
+    wrong = replace(best, predicted=best.measured - 0.1e-3)
+    rows = tuple(wrong if r is best else r for r in sweep.residuals)
+    assert sorted(abs(r.deviation) for r in rows)[-reading_plots.MAX_ROWS] > 0.1e-3
+    calibration = replace(sweep, residuals=rows)
+    x, _ = line(reading_plots.plot_residuals.figure(calibration).axes[0], "after")
+    np.testing.assert_allclose(x[0], 0.1, atol=UNIT)
+    listed = layout.to_text(render_readings(calibration, all_rows=True, worst_first=True))
+    first = listed.splitlines()[2].split()
+    assert first[0] == wrong.setup
+    assert "+0.100" in first
 
 
 def test_plots_of_many_readings_stay_small(many):
@@ -317,7 +348,7 @@ def test_an_unknown_noise_is_named_once(unknown):
 
 def test_cycles_are_named_where_there_are_some(raw, table1):
     names = row_names(reading_plots.plot_residuals.figure(raw).axes[0])
-    assert names[0] == "xz z_min, cycle 2"
+    assert names[0] == "xy zero, cycle 3"
     assert all(", cycle " in n for n in names)
     assert not any(
         "cycle" in n for n in row_names(reading_plots.plot_residuals.figure(table1).axes[0])

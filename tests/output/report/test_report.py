@@ -192,6 +192,7 @@ def test_full_model_shows_the_error_with_offsets_entered():
     found = calibrated("sweep", "full", **UNJUDGED)
     page = build_short_report(found)
     assert "without any other correction" in page
+    assert "Larger errors do not refute it" in page
     read = Reader(page)
     assert ["drive", "now", "new", "±", "identified", "unit"] in read.rows
     assert (
