@@ -10,6 +10,7 @@ from orthocal.arrays import Array
 from orthocal.measurement.motion.guidance import Guidance
 from orthocal.measurement.motion.stops import SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
+from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, Setup
@@ -56,6 +57,8 @@ class GaugePosition:
         self.poses: Mapping[str, Array] = {name: pose[0] for name, pose in poses.items()}
         """Poses of the links and of the leg's frames in the alignment posture, shape (4, 4),
         [m]."""
+        self.driven_noun = robot.driven_noun
+        """Noun for the part that the drive moves."""
         self.hinge_distances, self.lateral_offset = np.full(len(names), np.nan), np.zeros(3)
         """Distance of the contact from the rod's hinge at the drive, shape (K,), and vector from
         the rod's axis to the tip, across rod and plunger, in the alignment posture, shape (3,),
@@ -67,6 +70,11 @@ class GaugePosition:
             self.lateral_offset = _find_lateral_offset(
                 self.rod, self.contact, normals[self.aligned], axes[self.aligned]
             )
+        self.zero_distance: float | None = None
+        """Distance of a stated section from the rod's hinge at the drive, in the mechanical zero,
+        [m]."""
+        if self.rod is not None and isinstance(setup.sensor, LegIndicator):
+            self.zero_distance = setup.sensor.share_at_zero(robot, self.rod) * self.rod.length
         self.coordinates, self.origin_name = guidance.contact_point(setup.name)
         """Point of contact in the alignment posture, shape (3,), [m], from an origin: the tool
         centre point in the alignment posture."""
@@ -103,7 +111,7 @@ class GaugePosition:
 
 
 def hinge_distances(session: Session, setup: str, guidance: Guidance) -> dict[str, float]:
-    """Posture to the distance of a gauge's contact from the rod's hinge on the slide, [m].
+    """Posture to the distance of a gauge's contact from the rod's hinge at the drive, [m].
 
     It is empty for a gauge that touches no rod.
     """

@@ -82,9 +82,9 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         target = f"rod {gauge.rod.name} of leg {gauge.leg.name}"
         reach = gauge.hinge_distances / MM
         contact = (
-            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
-            "from the hinge on the slide. Then the rod slides past the tip: during the setup the "
-            f"distance becomes {reach.min():.0f} to {reach.max():.0f} mm. "
+            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {_from_hinge(gauge)}. Then the "
+            "rod slides past the tip: during the setup the distance becomes "
+            f"{reach.min():.0f} to {reach.max():.0f} mm. "
         )
         if gauge.tip is not None and gauge.tip.edge is None:
             contact += "Align the ball by eye: half a millimetre is good enough. "
@@ -103,6 +103,15 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "enter every reading of this setup with the opposite sign.",
     )
+
+
+def _from_hinge(gauge: GaugePosition) -> str:
+    """Distance of the contact from the hinge at the drive, now and in the mechanical zero."""
+    at, at_zero = gauge.hinge_distances[gauge.aligned], gauge.zero_distance
+    words = f"{at / MM:.1f} mm from the hinge on the {gauge.driven_noun}"
+    if at_zero is None or abs(at - at_zero) < VISIBLE:
+        return words
+    return f"{words} (at the mechanical zero it would be {at_zero / MM:.1f} mm)"
 
 
 def _around_ball(session: Session, setup: Setup, begin: Stop) -> str:

@@ -123,7 +123,9 @@ def test_stated_contact_is_on_the_rod(small, page):
     found = re.search(r"contact point is at X([-\d.]+) Y([-\d.]+) Z([-\d.]+) mm", text)
     assert [float(v) for v in found.groups()] == pytest.approx(expected / MM, abs=ROUNDED_PLACE)
     assert "on the +y side of rod a of leg x. Point its plunger to -y." in text
-    assert "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from" in text
+    assert "leg x, gauge in y, at 0.5 of its length from the slide at the mechanical zero" in text
+    hinge = "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from the hinge"
+    assert f"{hinge} on the slide. Then" in text
 
 
 def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
@@ -145,7 +147,7 @@ def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
 
 
 def test_lateral_offset_in_the_alignment_posture_is_stated(small):
-    """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod."""
+    """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod and hinge."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
     session = replace(small, readings=tuple(readings))
     text = words(sections(etree.HTML(sheet_files(session)["sheet.html"]))[0])
@@ -162,6 +164,10 @@ def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     found = re.search(r"with its centre (\d+\.\d) mm off the centre line, towards", text)
     assert float(found[1]) == pytest.approx(abs(aside), abs=ROUNDED_PLACE)
     assert abs(aside) > 1.0
+    at_zero = r"\(at the mechanical zero it would be 125\.0 mm\)"
+    found = re.search(rf"([\d.]+) mm from the hinge on the slide {at_zero}", text)
+    assert float(found[1]) == pytest.approx(np.linalg.norm(axis - root) / MM, abs=0.5)
+    assert abs(float(found[1]) - 125.0) > 10.0
 
 
 def test_alignment_posture_comes_before_the_first(small):
@@ -234,6 +240,8 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert "After you have set the gauge zero, do not touch the bezel" in text
     assert "controller: {offsets_mm: [0, 0, 0]}" in text
     assert words(page.findall(".//code")[-1]) == "orthocal calibrate . --out DIRECTORY"
+    assert "machine.yaml (orthocal new DIRECTORY --again)" in text
+    assert "measures (section: at the mechanical zero)" in text
     assert "`" not in text
 
 
@@ -262,7 +270,7 @@ def test_sheet_after_a_calibration_has_shifted_travel_and_ends_with_validation(s
     for active in ([0.0] * 3, [1e-3, 2e-3, 0.0]):
         session = small.with_controller(np.array(active))
         text = sheet_files(session)["sheet.html"].replace("−", "-")
-        assert ("A few mm are normal" in text) == (not any(active))
+        assert ("A smaller difference is normal" in text) == (not any(active))
         limits = (
             "-149.0 to 71.0 mm; y_slide -67.0 to 153.0 mm",
             "-150.0 to 70.0 mm; y_slide -65.0",
@@ -460,5 +468,7 @@ def test_a_displaced_tip_is_described_in_its_alignment_posture(small, tmp_path):
     recorded = run_orthocal(tmp_path, "record", path.parent, typed="quit\n").stdout
     for text in (sheet["sheet.html"], program, recorded):
         assert "aligned in" in text
+        assert "at 0.4 of its length from the slide at the mechanical zero" in " ".join(
+            text.split()
+        )
         assert "centre line by" not in text
-        assert not re.search("(?i)at the mechanical zero: leg", text)
