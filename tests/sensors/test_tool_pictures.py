@@ -126,8 +126,16 @@ def test_a_bar_turns_about_its_fixed_ball_with_the_tool(plan):
     assert any(part["path"].endswith("bar/bar") for part in command["animations"])
 
 
+def drawn_block(picture):
+    """Corners of the artefact, shape (4, 2), and the contact, shape (2,), on paper, [mm]."""
+    (outline,) = (p.get("points") for p in picture.iter("polygon") if p.get("fill") == "#dbe9d8")
+    (tip,) = (c for c in picture.iter("circle") if (c.get("r"), c.get("fill")) == ("1.10", "#222"))
+    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
+    return corners, np.array([float(tip.get("cx")), float(tip.get("cy"))])
+
+
 def test_a_gauge_block_stands_on_the_table(tmp_path):
-    """It is drawn from the tip on the table to the tip on the block."""
+    """It is drawn from the tip on the table to the tip on the block, beside it or under it."""
     (tmp_path / "plan.yaml").write_text(
         """robot: orthoglide
 gauge: {sigma_mm: 0.005, range_mm: [-5, 5]}

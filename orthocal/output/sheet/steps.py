@@ -10,7 +10,12 @@ from orthocal.measurement.motion.guidance import dial_zero, range_of_expected, s
 from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.gauge_noise import usual_difference
 from orthocal.output.sheet.coordinates import show_length, show_number, shown_place
-from orthocal.output.sheet.gauge_position import ABOUT_ALONG, GaugePosition, name_tip
+from orthocal.output.sheet.gauge_position import (
+    ABOUT_ALONG,
+    DIAL_LENGTH,
+    GaugePosition,
+    name_tip,
+)
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import has_dial, mounting_steps, probing_direction
@@ -151,6 +156,14 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
 def setup_warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> str:
     """Paragraphs with warnings before the readings of a setup."""
     texts = []
+    if gauge.rod is not None and gauge.facing is not None:
+        rod, room = gauge.facing
+        texts.append(
+            f"The gauge is between rods {gauge.rod.name} and {rod.name}, with {room / MM:.0f} mm "
+            f"for dial and plunger. A dial indicator needs about {DIAL_LENGTH / MM:.0f} mm. If "
+            f"yours does not fit, touch rod {rod.name} instead, from the same side: change "
+            "`touches` in session.yaml and run `orthocal sheet`."
+        )
     if gauge.near_hinge is not None:
         texts.append(
             f"The tip comes within {gauge.near_hinge / MM:.1f} mm of the middle of a hinge. Check "

@@ -317,6 +317,44 @@ def test_tip_near_a_hinge_causes_a_warning(small):
     assert text.count("of the middle of a hinge") == 1
 
 
+def test_a_gauge_between_two_rods_causes_a_warning(small):
+    """Rod b is 60 mm below rod a. The picture shows the dial between them."""
+    setup = small.setups["<b>yx"]
+    for direction, between in (("y", False), ("z", False), ("-z", True)):
+        sensor = replace(setup.sensor, direction=direction)
+        plan = replace(small, setups={**small.setups, "<b>yx": replace(setup, sensor=sensor)})
+        section = sections(etree.HTML(sheet_files(plan)["sheet.html"]))[0]
+        warning = "between rods a and b, with 52 mm for dial and plunger"
+        assert (warning in words(section)) is between
+        assert ("touch rod b instead" in words(section)) is between
+        circles = section.findall(".//svg")[1].findall(".//circle")
+        rods = [circle for circle in circles if circle.get("fill") in ("#9cc7e6", "#e3e7ec")]
+        (dial,) = (circle for circle in circles if circle.get("fill") == "#fff")
+        assert len(rods) == 2
+        for rod in rods:
+            (x, y, r), (a, b, s) = (
+                [float(circle.get(key)) for key in ("cx", "cy", "r")] for circle in (dial, rod)
+            )
+            assert np.hypot(x - a, y - b) > r + s
+
+
+def test_a_machine_with_cranks_is_described_without_slides(root, tmp_path):
+    (tmp_path / "plan.yaml").write_text(
+        f"robot: {root / 'examples/fivebar'}\n"
+        "postures: {zero: {tcp_mm: [0, 0]}, out: {tcp_mm: [10, 0]}}\n"
+        "setups: {up: {leg: left, touches: a, tip: {ball: {radius_mm: 1.5}}, "
+        "direction: [0, 0, 1], section: {fraction: 0.5}}}\n"
+    )
+    text = words(etree.HTML(sheet_files(load_plan(tmp_path / "plan.yaml"))["sheet.html"]))
+    assert "Jog each joint a little counterclockwise as seen from +z. Its number must grow" in text
+    assert "leg left, gauge in z, at 0.5 of its length from the crank at the mechanical" in text
+    assert "100.0 mm from the hinge on the crank" in text
+    assert "Correct the zero in the controller" in text
+    assert "or the others in fivebar.urdf and fivebar.yaml." in text
+    for words_of_slides in ("slide ", "outwards", "machine.yaml", "few mm"):
+        assert words_of_slides not in text
+
+
 def test_sessions_have_sheets(experiment_2):
     session = experiment_2
     found = sheet_files(session)
