@@ -183,7 +183,7 @@ def _setup(
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
     printer = session.firmware is not None
     noun = "Lines to send" if printer else "Program"
-    program = f" {noun}: {program_name(session, motion)}." if with_program else ""
+    program = f" {noun}: `{program_name(session, motion)}`." if with_program else ""
     sensor, name = session.setups[motion.setup].sensor, session.setups[motion.setup].gauge
     measured = describe_mounting(session.robot, sensor, gauge.alignment)
     if session.distinguish_gauge(name):
@@ -218,7 +218,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
     if robot.tcp is not None and points:
         shown = [", ".join(map(show_length, p)) for p in shown_tool(session, np.array(points))]
         letters = ", ".join("xyz"[c] for c in robot.tcp.coordinates)
-        columns.append((f"tool {letters} [mm]", "", shown))
+        columns.append((f"tool {letters} [mm]", "" if to_note else "tool", shown))
     if session.firmware is None:
         headers = [f"{d.name} [{DRIVE_UNITS[d.unit][0]}]" for d in robot.drives]
         values = zip(*(joint_values(robot, s.drives) for s in stops), strict=True)

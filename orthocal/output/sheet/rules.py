@@ -203,12 +203,9 @@ def reading_rules(session: Session, motions: Sequence[SetupMotion]) -> list[str]
     empty = "If you could not take a reading, leave the box empty."
     if not any(has_dial(setup.sensor) for setup in session.setups.values()):
         return [approach, f"Write down what the instrument shows, with its sign. {empty}"]
-    untouched = "During a setup, do not touch the bezel of the gauge or what holds it."
-    if any(setup.zero == "free" for setup in session.setups.values()):
-        untouched = (
-            "After you have set the gauge zero, do not touch the bezel, the stand or the arm of "
-            "the gauge."
-        )
+    is_set = any(setup.zero == "free" for setup in session.setups.values())
+    begin = "After you have set the gauge zero" if is_set else "During a setup"
+    untouched = f"{begin}, do not touch the bezel of the gauge or what holds it."
     return [
         approach,
         _contact_rule(session, motions),
@@ -226,7 +223,7 @@ def _contact_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
         return f"{rule}."
     return (
         f"{rule}, except during the motions that the setup names. Hold the plunger up during these "
-        "motions, then lower it onto the rod. Do not touch the stand or the bezel."
+        "motions, then lower it again. Do not touch the bezel of the gauge or what holds it."
     )
 
 

@@ -146,9 +146,11 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
     if setup.zero == "known" or not has_dial(setup.sensor):
         return set_dial(session, setup.name)
     again = " Set it again where the table says so." * (first.role == "subtracted")
+    held_by = "stand" if mounting_steps(setup.sensor) is None else "holder"
+    held_by = "post" if isinstance(setup.sensor, BallBar) else held_by
     return (
         f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Push "
-        "the stand lightly and release it: the hand must return to "
+        f"the {held_by} lightly and release it: the hand must return to "
         f"{dial_zero(session.gauges[setup.gauge])} within one step."
     )
 

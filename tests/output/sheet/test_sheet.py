@@ -462,12 +462,15 @@ def test_tables_of_readings_are_as_wide_as_the_text(browser, small, tmp_path):
 
 
 def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
-    """As the front page does, with offsets and backlash that are compensated."""
+    """As the front page does, with offsets and backlash that are compensated.
+
+    Tool coordinates and names of programs are in one line.
+    """
     make_robot(SMALL, tmp_path / "mine", counting=COUNTING)
     postures, setups = "", ""
     for k, leg in enumerate("xyz"):
         for i in range(9):
-            position = [15 * i - 60 if axis == k else 0 for axis in range(3)]
+            position = [15 * i - 60.125 if axis == k else 0 for axis in range(3)]
             postures += f"  {leg}{i}: {{tcp_mm: {position}}}\n"
     for leg, direction in permutations("xyz", 2):
         read = ", ".join(f"{leg}{i}" for i in range(9))
@@ -482,6 +485,17 @@ def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
     approached = [replace(r, conditions=Conditions(approach="pnp")) for r in plan.readings]
     plan = replace(plan, readings=tuple(approached))
     with printed_sheet(browser, plan, tmp_path) as page:
+        lines = page.evaluate(
+            """() => {
+                 const parts = 'td:nth-child(4), td:last-child:not(.note), p code';
+                 return [...document.querySelectorAll(parts)].map((part) => {
+                   const range = document.createRange();
+                   range.selectNodeContents(part);
+                   return [part.textContent, range.getClientRects().length];
+                 });
+               }"""
+        )
+        right = page.evaluate("document.documentElement.scrollWidth")
         front, *heights = page.evaluate(
             """() => {
                  const boxes = [...document.querySelectorAll('section[id]')].map(
@@ -491,6 +505,9 @@ def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
         )
     assert len(heights) == 6
     assert max(front, *heights) <= PAGE_HEIGHT
+    assert right <= round(PRINTED)
+    assert {"-60.125, 0, 0".replace("-", "−"), "01-yx.ngc"} < {text for text, _ in lines}
+    assert [text for text, count in lines if count != 1] == []
 
 
 def test_a_displaced_tip_is_described_in_its_alignment_posture(small, tmp_path):
