@@ -165,7 +165,8 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
     # in the middle of the leg
     for words in (
         "Monday: 6 readings in 2 setups on orthoglide; none is recorded yet.",
-        "Setup yx, 1 of 2: 3 readings Place at the mechanical zero: leg x, gauge in y, at 0.5",
+        "Setup yx, 1 of 2: 3 readings Place: leg x, gauge in y, at 0.5",
+        "of its length from the slide at the mechanical zero",
         "Stand: on the +y side, so that the tip in posture zero touches 155.1 mm from the hinge",
         "Push the plunger in: the reading must grow. If it falls, enter every reading of",
         "Dial: -5 to 5 mm, resolution 0.01 mm",

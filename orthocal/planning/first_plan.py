@@ -188,7 +188,7 @@ def bed_plan(robot: Robot, equipment: Equipment) -> Session:
     points = (points + middle).round(9) + 0.0
     names = [posture_name(robot, p, middle) for p in points]
     length = float(np.ptp(box[:2], axis=1).max())
-    plate = Artefact("plate", length=length, form_std=read_limit(BED_FLATNESS))
+    bed = Artefact("plate", length=length, form_std=read_limit(BED_FLATNESS), bed=True)
     above = Conditions("n" * len(robot.drives))
     readings = [Reading(BED_SETUP, name, conditions=above) for name in names]
     return Session(
@@ -197,7 +197,7 @@ def bed_plan(robot: Robot, equipment: Equipment) -> Session:
         title="Dial at the tool over the bed",
         gauges={"": equipment.gauge},
         postures=place_tool(robot, names, points),
-        setups={BED_SETUP: Setup(BED_SETUP, ToolIndicator("-z", plate))},
+        setups={BED_SETUP: Setup(BED_SETUP, ToolIndicator("-z", bed))},
         readings=(*readings, replace(readings[0], cycle=2)),
     )
 

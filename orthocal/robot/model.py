@@ -270,6 +270,11 @@ class Robot:
         return "legs" if all(leg.follows_slide for leg in self.legs.values()) else "rods"
 
     @property
+    def driven_noun(self) -> str:
+        """Noun for the parts that the drives move, and to which the rods are hinged."""
+        return "slide" if all(d.unit == "m" for d in self.drives) else "crank"
+
+    @property
     def effect_names(self) -> tuple[str, ...]:
         """Effects of the machine in addition to those of geometry and drives."""
         return tuple(self.declared.effects) if self.chosen_effects is None else self.chosen_effects

@@ -27,6 +27,9 @@ Direction = str | tuple[float, float, float]
 CACHE_SIZE = 256
 """Directions whose vectors are cached: a plan has many setups with few directions."""
 
+ALONG_AXIS = 1.0 - 1e-9
+"""Cosine above which a vector has the name of an axis."""
+
 PARALLEL_DEG = 1.0
 """Angle to a leg below which a direction counts as along the leg."""
 
@@ -55,10 +58,14 @@ def side_vector(axis: tuple[float, float, float], direction: Direction) -> Array
 
 
 def direction_name(direction: Direction) -> str:
-    """Name of a direction, or its vector in parentheses, with three digits."""
+    """Name of a direction along an axis; otherwise its vector in parentheses, with three digits."""
     if isinstance(direction, str):
         return direction
-    return f"({', '.join(f'{v:.3g}' for v in direction)})"
+    unit = direction_vector(direction)
+    for name, axis in DIRECTIONS.items():
+        if unit @ axis > ALONG_AXIS:
+            return name
+    return f"({', '.join(f'{round(v, 9) + 0.0:.3g}' for v in direction)})"
 
 
 def check_direction(direction: Direction, leg: Leg, largest_deg: float, *, where: str) -> None:

@@ -28,7 +28,7 @@ from pydantic import Field, field_validator
 from orthocal.arrays import Array, triple
 from orthocal.errors import SessionError
 from orthocal.io.documents import Name, Number, OneKey
-from orthocal.robot.model import Leg, Robot
+from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.direction import (
     DIRECTIONS,
     Direction,
@@ -141,12 +141,17 @@ class Section:
         """Keys for a session.yaml."""
         return {self.form: self.value if self.form == "fraction" else to_mm(self.value)}
 
-    def describe(self) -> str:
-        """Description of the position."""
+    def describe(self, driven: str) -> str:
+        """Description of the position.
+
+        Args:
+            driven: Noun for the part that the drive moves, with a reference to the mechanical zero.
+        """
+        if self.form == "coordinate_mm":
+            return f"coordinate {show_mm(self.value)} mm"
         if self.form == "fraction":
-            return f"{self.value:.3g} of its length from the slide"
-        from_root = " from its hinge on the slide" if self.form == "from_root_mm" else ""
-        return f"{'' if from_root else 'coordinate '}{show_mm(self.value)} mm{from_root}"
+            return f"{self.value:.3g} of its length from the {driven}"
+        return f"{show_mm(self.value)} mm from its hinge on the {driven}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +278,16 @@ class LegIndicator:
 
     def describe(self) -> str:
         """Short description with leg, direction and section, and with rod and tip."""
+        return self.describe_from("slide")
+
+    def describe_from(self, driven: str) -> str:
+        """Short description with a noun for the part from which the section is counted.
+
+        Args:
+            driven: Noun for the part that the drive moves, with a reference to the mechanical zero.
+        """
         direction = direction_name(self.direction)
-        words = f"leg {self.leg}, gauge in {direction}, at {self.section.describe()}"
+        words = f"leg {self.leg}, gauge in {direction}, at {self.section.describe(driven)}"
         if self.rod is not None:
             words += f", {self.tip.form} on rod {self.rod}"
         offsets = [
@@ -308,11 +321,8 @@ class LegIndicator:
         if self.rod is not None:
             rod = leg.rods[self.rod]
             radius = rod.radius + self.tip.radius
-            # point of the nominal rod in the plane of the section, in the mechanical zero
-            coordinate = plane + (float(leg.axis @ leg.reference_root) if from_root else 0.0)
-            along = rod.reference_tip - rod.reference_root
-            share = (coordinate - leg.axis @ rod.reference_root) / (leg.axis @ along)
-            point = rod.reference_root + share * along
+            share = self.share_at_zero(robot, rod)
+            point = rod.reference_root + share * (rod.reference_tip - rod.reference_root)
             across = point - (leg.axis @ point) * leg.axis + self.beside
         direction, side = direction_vector(self.direction), self._side(robot)
         return np.array([*direction, plane, float(from_root), *leg.axis, *side, *across, radius])
@@ -456,6 +466,14 @@ class LegIndicator:
                 where=where,
             )
         return (value * leg.length if form == "fraction" else value), True
+
+    def share_at_zero(self, robot: Robot, rod: Rod) -> float:
+        """Section as a fraction of a nominal rod from its root, in the mechanical zero."""
+        leg = robot.legs[self.leg]
+        plane, from_root = self.plane(robot)
+        coordinate = plane + (float(leg.axis @ leg.reference_root) if from_root else 0.0)
+        along = rod.reference_tip - rod.reference_root
+        return float((coordinate - leg.axis @ rod.reference_root) / (leg.axis @ along))
 
     def _side(self, robot: Robot) -> Array:
         """Unit vector across leg and plunger, shape (3,): the direction of a blade's edge."""

@@ -111,11 +111,13 @@ class SquareKeys(_EdgeKeys):
 
 
 class PlateKeys(_ArtefactKeys):
-    """Surface plate."""
+    """Surface plate, or the bed of the machine."""
 
     kind: Literal["plate"]
     length_mm: Length = LENGTH_MM
     flat_tolerance_mm: Millimetres = 0.0
+    bed: bool = False
+    """True for the bed of the machine."""
 
 
 class GaugeBlockKeys(_ArtefactKeys):
@@ -166,12 +168,19 @@ class Artefact:
     square_std: float = 0.0
     """Right angle of a square, [rad]."""
     reversed: bool = False
+    bed: bool = False
+    """True for a plate that is the bed of the machine."""
     height: float = 0.0
     """Height of a gauge block, [m]."""
     height_std: float = 0.0
     table: float = 0.0
     """Coordinate of the tool centre point along the plunger while the tip touches the plane beside
     the block, [m]."""
+
+    @property
+    def noun(self) -> str:
+        """Noun for the artefact in descriptions."""
+        return "bed" if self.bed else self.kind.replace("_", " ")
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
@@ -245,6 +254,7 @@ class ToolIndicator(ToolSensor):
             fields |= {
                 "length": a.length_mm * MM,
                 "form_std": read_tolerance(a.flat_tolerance_mm, MM),
+                "bed": a.bed,
             }
         else:
             fields |= {
@@ -273,8 +283,7 @@ class ToolIndicator(ToolSensor):
             artefact |= {f"{form}_tolerance_mm": show_tolerance(a.form_std, MM)}
         if a.kind == "square":
             artefact["square_tolerance_mrad"] = show_tolerance(a.square_std, MRAD)
-        if a.reversed:
-            artefact["reversed"] = True
+        artefact |= {key: True for key in ("bed", "reversed") if getattr(a, key)}
         artefact["direction_tolerance_mrad"] = show_tolerance(a.direction_std, MRAD)
         keys: dict[str, Any] = {"direction": self.direction, "artefact": artefact}
         if any(self.tool):
@@ -286,7 +295,7 @@ class ToolIndicator(ToolSensor):
     def describe(self) -> str:
         """Short description with the direction of the plunger and the artefact."""
         a = self.artefact
-        words = a.kind.replace("_", " ")
+        words = a.noun
         if a.kind == "gauge_block":
             words += f" of {show_mm(a.height)} mm"
         along = "" if a.along is None else f" along {a.along}"
@@ -297,19 +306,21 @@ class ToolIndicator(ToolSensor):
     def mounting_steps(self) -> tuple[str, ...]:
         """Instructions for mounting the indicator and its artefact."""
         a = self.artefact
-        words = a.kind.replace("_", " ")
+        words = a.noun
         if a.kind == "gauge_block":
-            place = (
-                "Prepare a flat surface on the table. Where the posture is higher, put the gauge "
-                f"block of {show_mm(a.height)} mm under the tip."
-            )
+            place = "Prepare a flat surface on the table."
+            block = f"the {words} of {show_mm(a.height)} mm"
+            words = f"flat surface. Where the posture is higher, put {block} under the tip"
+        elif a.bed:
+            place = "Use no plate: the plunger touches the bed itself."
         elif a.along is None:
             place = f"Put the {words} on the table, square to the plunger by eye."
         else:
             place = f"Put the {words} on the table, along {a.along} of the machine by eye."
         over = " Turn it over since its other setup." if a.reversed else ""
+        clamp = "" if a.bed or a.kind == "gauge_block" else " Clamp it."
         return (
-            place + over + " Clamp it. It must not move until all its readings are taken.",
+            f"{place}{over}{clamp} It must not move until all its readings are taken.",
             f"Mount the indicator at the tool. Its plunger points to {self.direction} and touches "
             f"the {words}.",
             "Push the plunger in with a finger. The reading must grow. If it falls, enter "

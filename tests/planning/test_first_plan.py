@@ -101,6 +101,9 @@ def test_the_bed_of_a_delta_is_read_on_a_grid_from_above(delta):
     sheet = files["sheet.html"]
     assert "by eye, once: the tool at x 0, y 0, z 0 mm" in sheet
     assert "a little upwards" in sheet
+    assert "the plunger touches the bed itself. It must not move" in sheet
+    assert "and touches the bed." in sheet
+    assert "Clamp it" not in sheet
 
 
 def test_the_bed_determines_a_delta_better_than_its_legs(delta):

@@ -221,6 +221,8 @@ def test_descriptions_state_lengths_to_a_micrometre_and_directions_to_three_digi
     section = Section("coordinate_mm", -0.1031234567)
     line = LegIndicator("x", (0.0, np.sqrt(0.75), 0.5), section)
     assert line.describe() == "leg x, gauge in (0, 0.866, 0.5), at coordinate -103.123 mm"
+    for direction, name in (((0.0, -2.0, 0.0), "-y"), ((0.6, 0.8, -0.0), "(0.6, 0.8, 0)")):
+        assert f"gauge in {name}, at" in LegIndicator("x", direction, section).describe()
     ball = line.on_rod("a", Tip("ball", 0.0015), (0.0, -0.0001234567, 2e-7))
     assert ball.describe().endswith(", off its centre line by 0.123 mm towards −y")
 

@@ -30,7 +30,7 @@ ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 STEPS = (-60, -30, 0, 30, 60)
 SQUARE = "kind: square, name: granite, square_tolerance_mrad: 0.02, straight_tolerance_mm: 0.002"
-PLATE = "kind: plate, flat_tolerance_mm: 0.003"
+PLATE = "kind: plate, flat_tolerance_mm: 0.003, bed: true"
 BLOCK = "kind: gauge_block, height_mm: 50, height_tolerance_mm: 0.0005, table_mm: -25"
 PAPER = """  leg_{d}{leg}: {{leg: {leg}, direction: {d}, section: {{fraction: 0.5}},
     postures: [zero, {leg}_60, {leg}_-100]}}"""

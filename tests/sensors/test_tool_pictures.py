@@ -126,8 +126,16 @@ def test_a_bar_turns_about_its_fixed_ball_with_the_tool(plan):
     assert any(part["path"].endswith("bar/bar") for part in command["animations"])
 
 
+def drawn_block(picture):
+    """Corners of the artefact, shape (4, 2), and the contact, shape (2,), on paper, [mm]."""
+    (outline,) = (p.get("points") for p in picture.iter("polygon") if p.get("fill") == "#dbe9d8")
+    (tip,) = (c for c in picture.iter("circle") if (c.get("r"), c.get("fill")) == ("1.10", "#222"))
+    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
+    return corners, np.array([float(tip.get("cx")), float(tip.get("cy"))])
+
+
 def test_a_gauge_block_stands_on_the_table(tmp_path):
-    """It is drawn from the tip on the table to the tip on the block."""
+    """It is drawn from the tip on the table to the tip on the block, beside it or under it."""
     (tmp_path / "plan.yaml").write_text(
         """robot: orthoglide
 gauge: {sigma_mm: 0.005, range_mm: [-5, 5]}
@@ -139,7 +147,25 @@ setups:
          artefact: {kind: gauge_block, height_mm: 50, table_mm: 20}}
 """
     )
-    _, contact = locate_contacts(load_plan(tmp_path / "plan.yaml"))["step"]
+    plan = load_plan(tmp_path / "plan.yaml")
+    for posture in ("beside", "above"):
+        setups = {"step": replace(plan.setups["step"], aligned_at=posture)}
+        files = sheet_files(replace(plan, setups=setups))
+        block, tip = drawn_block(section(files, 1).findall(".//svg")[1])
+        (low, top), (high, bottom) = block.min(axis=0), block.max(axis=0)
+        if posture == "above":
+            assert tip == pytest.approx([0.5 * (low + high), top], abs=0.02)
+        else:
+            assert tip[1] == pytest.approx(bottom, abs=0.02)
+            assert not low - 5.0 < tip[0] < high + 5.0  # the radius of the dial
+    rules = words(etree.HTML(files["sheet.html"]).find(".//header").getparent())
+    assert "Hold the plunger up during these motions, then lower it again." in rules
+    steps = words(section(files, 1))
+    assert "touches the flat surface. Where the posture is higher, put the gauge block of" in steps
+    assert "Clamp it" not in steps
+    assert "Push the holder lightly" in steps
+    assert "stand" not in rules
+    _, contact = locate_contacts(plan)["step"]
     tips, corners = contact.points[:, 2], contact.surface[:, 2]
     assert np.array([corners.min(), corners.max()]) == pytest.approx(np.sort(tips), abs=1e-9)
     assert contact.surface[:, 0] == pytest.approx([0.01] * 4, abs=0.018)

@@ -74,23 +74,22 @@ def guide(session: Session) -> Guidance:
     )
 
 
-def is_displaced(sensor: Sensor) -> bool:
-    """True if a tip is displaced from its rod in the mechanical zero, where it may not touch it."""
-    return isinstance(sensor, LegIndicator) and any(sensor.beside)
-
-
-def describe_mounting(sensor: Sensor, aligned_at: str) -> str:
+def describe_mounting(robot: Robot, sensor: Sensor, aligned_at: str, *, brief: bool = False) -> str:
     """Description of a sensor for the operator who mounts it.
 
-    A displaced tip is described in the alignment posture, in which it touches its rod.
+    A tip that is beside its rod in the mechanical zero is described in the alignment posture.
 
     Args:
+        robot: The robot.
         sensor: The sensor.
         aligned_at: Name of its alignment posture.
+        brief: Whether to omit that a section is stated for the mechanical zero.
     """
-    if not isinstance(sensor, LegIndicator) or not is_displaced(sensor):
+    if not isinstance(sensor, LegIndicator):
         return sensor.describe()
-    return f"{replace(sensor, beside=(0.0, 0.0, 0.0)).describe()}, aligned in {aligned_at}"
+    driven = robot.driven_noun + " at the mechanical zero" * (not brief)
+    words = replace(sensor, beside=(0.0, 0.0, 0.0)).describe_from(driven)
+    return f"{words}, aligned in {aligned_at}" if any(sensor.beside) else words
 
 
 def dial_zero(gauge: Gauge) -> str:

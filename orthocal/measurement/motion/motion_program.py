@@ -186,7 +186,7 @@ def write_program(
     lines = [
         f"(orthocal: {comment_safe(robot.name, LONGEST_NAME)}, setup "
         f"{comment_safe(motion.setup, LONGEST_NAME)}, {motion.number} of {motion.count})",
-        f"({comment_safe(describe_mounting(sensor, aligned), 120)})",
+        f"({comment_safe(describe_mounting(robot, sensor, aligned), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(session, start_point(session))})",
         *_before_start(session, sensor, stops[0]),

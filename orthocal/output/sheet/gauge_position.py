@@ -9,7 +9,8 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.measurement.motion.guidance import Guidance
 from orthocal.measurement.motion.stops import SetupMotion
-from orthocal.robot.model import Leg, Robot, Rod
+from orthocal.robot.model import Leg, Line, Robot, Rod
+from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session, Setup
@@ -21,6 +22,12 @@ ABOUT_ALONG = 0.97
 
 NEAR_HINGE = 0.012
 """Smallest distance of a tip from the end of a rod that needs no warning, [m]."""
+
+SAME_HEIGHT = 1e-3
+"""Largest difference of heights along a plunger that counts as none, [m]."""
+
+DIAL_LENGTH, DIAL_WIDTH = 120 * MM, 60 * MM
+"""Room that a dial indicator with its plunger needs along and across the plunger, [m]."""
 
 
 class GaugePosition:
@@ -56,6 +63,8 @@ class GaugePosition:
         self.poses: Mapping[str, Array] = {name: pose[0] for name, pose in poses.items()}
         """Poses of the links and of the leg's frames in the alignment posture, shape (4, 4),
         [m]."""
+        self.driven_noun = robot.driven_noun
+        """Noun for the part that the drive moves."""
         self.hinge_distances, self.lateral_offset = np.full(len(names), np.nan), np.zeros(3)
         """Distance of the contact from the rod's hinge at the drive, shape (K,), and vector from
         the rod's axis to the tip, across rod and plunger, in the alignment posture, shape (3,),
@@ -67,6 +76,11 @@ class GaugePosition:
             self.lateral_offset = _find_lateral_offset(
                 self.rod, self.contact, normals[self.aligned], axes[self.aligned]
             )
+        self.zero_distance: float | None = None
+        """Distance of a stated section from the rod's hinge at the drive, in the mechanical zero,
+        [m]."""
+        if self.rod is not None and isinstance(setup.sensor, LegIndicator):
+            self.zero_distance = setup.sensor.share_at_zero(robot, self.rod) * self.rod.length
         self.coordinates, self.origin_name = guidance.contact_point(setup.name)
         """Point of contact in the alignment posture, shape (3,), [m], from an origin: the tool
         centre point in the alignment posture."""
@@ -93,6 +107,52 @@ class GaugePosition:
         return np.asarray(self.poses[frame][:3, 3])
 
     @property
+    def surface(self) -> Array | None:
+        """Corners of the artefact in the alignment posture, shape (4, 3), [m]; None without one.
+
+        A gauge block that only other postures need is beside the tip.
+        """
+        surface = self.contact.surface
+        if surface is None:
+            return None
+        height = (self.point - surface) @ self.contact.direction
+        if np.ptp(height) < SAME_HEIGHT or height.max() < SAME_HEIGHT:
+            return surface
+        return np.asarray(surface + surface[1] - surface[0])
+
+    def cut(self, line: Line, axis: Array) -> Array:
+        """Point of a line in the plane through the contact, in the alignment posture.
+
+        Args:
+            line: A leg or a rod.
+            axis: Normal of the plane, shape (3,).
+
+        Returns:
+            Shape (3,), [m].
+        """
+        a, b = self.origin(line.root), self.origin(line.tip)
+        share = (self.point - a) @ axis / ((b - a) @ axis)
+        return np.asarray(a + share * (b - a))
+
+    @property
+    def facing(self) -> tuple[Rod, float] | None:
+        """Nearest rod of the leg behind the gauge, and the free distance to the touched rod, [m].
+
+        None if a dial indicator fits between both.
+        """
+        if self.leg is None or self.rod is None:
+            return None
+        facing, direction, along = [], self.contact.direction, self.contact.along
+        for rod in self.leg.rods.values():
+            across = self.cut(rod, along) - self.cut(self.rod, along)
+            distance = float(across @ direction)
+            aside = float(np.linalg.norm(across - distance * direction))
+            room = distance - rod.radius - self.rod.radius
+            if 0.0 < room < DIAL_LENGTH and aside < 0.5 * DIAL_WIDTH + rod.radius:
+                facing.append((rod, room))
+        return min(facing, key=lambda found: found[1], default=None)
+
+    @property
     def near_hinge(self) -> float | None:
         """Distance of the tip from a hinge, if it is too small, [m]."""
         if self.rod is None:
@@ -103,7 +163,7 @@ class GaugePosition:
 
 
 def hinge_distances(session: Session, setup: str, guidance: Guidance) -> dict[str, float]:
-    """Posture to the distance of a gauge's contact from the rod's hinge on the slide, [m].
+    """Posture to the distance of a gauge's contact from the rod's hinge at the drive, [m].
 
     It is empty for a gauge that touches no rod.
     """

@@ -9,7 +9,7 @@ import numpy as np
 from orthocal.assessment.wording import counted
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.measurement.motion.approach import describe_approach
-from orthocal.measurement.motion.guidance import describe_mounting, guide, is_displaced, shown_tool
+from orthocal.measurement.motion.guidance import describe_mounting, guide, shown_tool
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import (
     ProgramOptions,
@@ -115,8 +115,10 @@ def _front(
     count = f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}"
     lead = f"{count}. Gauge: {gauges}."
     several = len(session.gauges_with_readings) > 1
+    on_leg = any(setup.sensor.place[0] == "leg" for setup in session.setups.values())
+    measures = "measures" + " (section: at the mechanical zero)" * on_leg
     headers = (
-        *("", "setup", "measures", *(["gauge"] if several else []), "readings"),
+        *("", "setup", measures, *(["gauge"] if several else []), "readings"),
         *(["program" if session.firmware is None else "lines to send"] if with_programs else []),
     )
     rows, aligned_at = [], session.alignment_postures
@@ -125,7 +127,7 @@ def _front(
         setup = session.setups[m.setup]
         gauge = (setup.gauge,) if several else ()
         program = (program_name(session, m),) if with_programs else ()
-        measured = describe_mounting(setup.sensor, aligned_at[m.setup])
+        measured = describe_mounting(robot, setup.sensor, aligned_at[m.setup], brief=True)
         rows.append((str(m.number), m.setup, measured, *gauge, count, *program))
     checks = checks_of_machine(session) if session.firmware is None else CHECKS_OF_PRINTER
     programs = with_programs and session.firmware is None
@@ -181,18 +183,17 @@ def _setup(
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
     printer = session.firmware is not None
     noun = "Lines to send" if printer else "Program"
-    program = f" {noun}: {program_name(session, motion)}." if with_program else ""
+    program = f" {noun}: `{program_name(session, motion)}`." if with_program else ""
     sensor, name = session.setups[motion.setup].sensor, session.setups[motion.setup].gauge
-    measured = describe_mounting(sensor, gauge.alignment)
+    measured = describe_mounting(session.robot, sensor, gauge.alignment)
     if session.distinguish_gauge(name):
         measured += f". Gauge: {_gauge(name, session.gauges[name])}"
-    at_zero = "" if gauge.leg is None or is_displaced(sensor) else "At the mechanical zero: "
     end = compare_closing(session, motion)
     remove = REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
     end += REMOVE_FROM_PRINTER if printer else remove
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
-        f"{paragraph(f'{at_zero}{measured}.{program}', kind='lead')}"
+        f"{paragraph(f'{measured}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
         f"{_numbered(list_steps(session, motion, gauge))}"
         f"{setup_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(end)}"
@@ -217,7 +218,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
     if robot.tcp is not None and points:
         shown = [", ".join(map(show_length, p)) for p in shown_tool(session, np.array(points))]
         letters = ", ".join("xyz"[c] for c in robot.tcp.coordinates)
-        columns.append((f"tool {letters} [mm]", "", shown))
+        columns.append((f"tool {letters} [mm]", "" if to_note else "tool", shown))
     if session.firmware is None:
         headers = [f"{d.name} [{DRIVE_UNITS[d.unit][0]}]" for d in robot.drives]
         values = zip(*(joint_values(robot, s.drives) for s in stops), strict=True)

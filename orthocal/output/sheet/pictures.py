@@ -337,7 +337,7 @@ def draw_machine(robot: Robot, visuals: Sequence[Visual], gauge: GaugePosition) 
     shapes = [(visual, _visual_points(visual, gauge.poses[visual.link])) for visual in visuals]
     reach = 0.32 * float(np.ptp(np.concatenate([p for _, p in shapes]), axis=0).max())
     dial = _gauge_end(gauge, reach)
-    surface = np.zeros((0, 3)) if gauge.contact.surface is None else gauge.contact.surface
+    surface = np.zeros((0, 3)) if gauge.surface is None else gauge.surface
     points = np.concatenate([*(p for _, p in shapes), dial[None], gauge.tool_path, surface])
     view = _View(-np.array(VIEW), np.eye(3)[2], points, MACHINE_SIZE)
     picture = Picture(*MACHINE_SIZE)
@@ -374,6 +374,8 @@ def _gauge_end(gauge: GaugePosition, reach: float) -> Array:
     contact = gauge.contact
     if contact.fixed is not None:
         return contact.fixed
+    if gauge.facing is not None:  # between two rods
+        reach = min(reach, 0.5 * gauge.facing[1])
     return np.asarray(gauge.point + (-reach if contact.at_tool else reach) * contact.direction)
 
 
@@ -475,10 +477,11 @@ def _draw_dial(
         gauge: The gauge.
         top: Lower end of the plunger on paper, [mm].
         dial: Centre of the dial on paper, [mm].
-        radius: Radius of the dial on paper, [mm].
+        radius: Largest radius of the dial on paper, [mm].
     """
     if not np.any(gauge.contact.direction):
         return
+    radius = min(radius, 0.45 * float(np.linalg.norm(dial - top)))
     picture.line([top, dial], stroke="#fff", width=2.4)
     picture.line([top, dial], width=0.9)
     shown = "dial" if has_dial(gauge.setup.sensor) else "reading"
@@ -519,7 +522,7 @@ def draw_tool(gauge: GaugePosition) -> str:
     The view is along the axis of the world that shows most, or oblique for contacts in space.
     """
     contact = gauge.contact
-    parts = [contact.points, *([] if contact.surface is None else [contact.surface])]
+    parts = [contact.points, *([] if gauge.surface is None else [gauge.surface])]
     parts += [] if contact.fixed is None else [contact.fixed[None]]
     size = max(float(np.ptp(np.concatenate(parts), axis=0).max()), 0.02)
     end = _gauge_end(gauge, 0.35 * size)
@@ -535,8 +538,8 @@ def draw_tool(gauge: GaugePosition) -> str:
     up = np.eye(3)[2] if abs(forward[2]) < 0.9 * np.linalg.norm(forward) else np.eye(3)[1]
     view = _View(forward, up, around, SECTION_SIZE)
     picture = Picture(*SECTION_SIZE)
-    if contact.surface is not None:
-        picture.polygon(view.project(contact.surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
+    if gauge.surface is not None:
+        picture.polygon(view.project(gauge.surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
     for place in view.project(contact.points):
         picture.circle(place, 0.9, fill=GREEN, stroke="#fff")
     _draw_sensor(picture, view, gauge, end)
@@ -555,13 +558,12 @@ def draw_section(gauge: GaugePosition) -> str:
         return ""
     axis = gauge.origin(leg.tip) - gauge.origin(leg.root)
     axis /= np.linalg.norm(axis)
-    rods = {name: _cut(gauge, rod.root, rod.tip, axis) for name, rod in leg.rods.items()}
-    line = _cut(gauge, leg.root, leg.tip, axis)
+    rods = {name: gauge.cut(rod, axis) for name, rod in leg.rods.items()}
+    line = gauge.cut(leg, axis)
     direction = gauge.contact.direction
     spread = max([0.0, *(float(np.linalg.norm(p - line)) for p in rods.values())])
-    far = 0.75 * max(0.02, 2.0 * spread)
-    dial = gauge.point + far * direction
-    around = [line, gauge.point, dial + 0.25 * far * direction, *rods.values()]
+    dial = _gauge_end(gauge, 0.75 * max(0.02, 2.0 * spread))
+    around = [line, gauge.point, 1.25 * dial - 0.25 * gauge.point, *rods.values()]
     if gauge.tip is not None and gauge.tip.edge is not None:
         half = 0.5 * gauge.tip.width * gauge.tip.edge
         around += [gauge.point - half, gauge.point + half]
@@ -596,13 +598,6 @@ def draw_section(gauge: GaugePosition) -> str:
     return picture.to_svg(f"Setup {gauge.setup.name}: the rods seen along leg {leg.name}")
 
 
-def _cut(gauge: GaugePosition, root: str, tip: str, axis: Array) -> Array:
-    """Point of a line in the plane across a leg through the contact, shape (3,), [m]."""
-    a, b = gauge.origin(root), gauge.origin(tip)
-    share = (gauge.point - a) @ axis / ((b - a) @ axis)
-    return np.asarray(a + share * (b - a))
-
-
 def _free_corner(points: Array) -> Array:
     """The corner of the section that is furthest from all points, shape (2,), [mm]."""
     low, high = 13.0, SECTION_SIZE[0] - 13.0
@@ -615,7 +610,7 @@ def _tip_centre(gauge: GaugePosition) -> Array:
     """Centre of a ball, else the point of contact, in the alignment posture, shape (3,), [m]."""
     if gauge.rod is None or gauge.tip is None or gauge.tip.edge is not None:
         return gauge.point
-    axis = _cut(gauge, gauge.rod.root, gauge.rod.tip, gauge.contact.along)
+    axis = gauge.cut(gauge.rod, gauge.contact.along)
     return np.asarray(axis + (1.0 + gauge.tip.radius / gauge.rod.radius) * (gauge.point - axis))
 
 

@@ -6,8 +6,9 @@ import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
+import pinocchio as pin
 
-from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC
+from orthocal.assessment.wording import OFFSETS_IN_LINUXCNC, name_direction
 from orthocal.effects.compensation import describe_trims, home_positions
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import AS_ARROWS_SHOW, approach_length, describe_approach
@@ -46,16 +47,20 @@ BY_EYE = 0.01
 def checks_of_machine(session: Session) -> list[str]:
     """Checks of a machine whose drives are joints of its controller."""
     robot = session.robot
-    normal = "" if is_corrected(session) else "A few mm are normal: the calibration finds them. "
+    normal = (
+        ""
+        if is_corrected(session)
+        else " A smaller difference is normal: the calibration finds it."
+    )
     return [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken. If "
         "you must home it again, repeat the interrupted setup.",
         f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
-        f"controller must show about {joint_list(robot, robot.drive_zero)}. {normal}If a number "
-        f"differs by more than {_largest_difference(robot)}, the zero of the joint, a dimension or "
-        "the direction of counting is wrong. Correct the zero in the controller (LinuxCNC: "
-        "HOME_OFFSET), or the others in machine.yaml (`orthocal new DIRECTORY --again`). From now "
-        "on, drive to the numbers printed here, not by eye. Travel of the joints: "
+        f"controller must show about {joint_list(robot, robot.drive_zero)}. If a number differs by "
+        f"more than {_largest_difference(robot)}, the zero of the joint, a dimension or the "
+        f"direction of counting is wrong.{normal} Correct the zero in the controller (LinuxCNC: "
+        f"HOME_OFFSET), or the others in {_dimension_files(robot)}. From now on, drive to the "
+        "numbers printed here, not by eye. Travel of the joints: "
         f"{'; '.join(_travel(session))}.",
         f"Jog each joint a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
@@ -80,6 +85,13 @@ def _largest_difference(robot: Robot) -> str:
         limit = math.ceil((LIMIT * offset.prior_std + by_eye) / size)
         largest[unit] = max(largest.get(unit, 0), limit)
     return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
+
+
+def _dimension_files(robot: Robot) -> str:
+    """Files in which the user states dimensions and directions of counting."""
+    if robot.folder is not None and (robot.folder / "machine.yaml").is_file():
+        return "machine.yaml (`orthocal new DIRECTORY --again`)"
+    return f"{robot.urdf.name} and {robot.yaml.name}"
 
 
 def _active_offsets(session: Session) -> str:
@@ -155,10 +167,26 @@ def _zero_by_eye(robot: Robot) -> str:
 
 
 def _growing(robot: Robot) -> str:
-    """Direction in which the slides move as the coordinates of the drives grow."""
+    """Direction in which the drives move as their coordinates grow."""
     legs = robot.legs.values()
     upwards = legs and all(leg.root_motion[2] > 1.0 - PARALLEL_SINE for leg in legs)
-    return "upwards" if upwards else "outwards"
+    slide = "upwards" if upwards else "outwards"
+    ways = [slide if d.unit == "m" else _describe_rotation(robot, d.name) for d in robot.drives]
+    if len(set(ways)) == 1:
+        return ways[0]
+    return ", ".join(f"{d.name} {way}" for d, way in zip(robot.drives, ways, strict=True))
+
+
+def _describe_rotation(robot: Robot, drive: str) -> str:
+    """Sense of rotation of a drive as its coordinate grows, in the reference posture."""
+    model, data = robot.model, robot.model.createData()
+    pin.computeJointJacobians(model, data, robot.configuration(robot.reference_posture))
+    joint, world = model.getJointId(drive), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    jacobian = np.reshape(pin.getJointJacobian(model, data, joint, world), (6, model.nv))
+    axis = jacobian[3:, model.joints[joint].idx_v]
+    sense = "clockwise" if axis[np.abs(axis).argmax()] < 0.0 else "counterclockwise"
+    seen_from = -axis if sense == "clockwise" else axis
+    return f"{sense} as seen from {name_direction(seen_from)}"
 
 
 def _count_outwards(robot: Robot) -> str:
@@ -175,12 +203,9 @@ def reading_rules(session: Session, motions: Sequence[SetupMotion]) -> list[str]
     empty = "If you could not take a reading, leave the box empty."
     if not any(has_dial(setup.sensor) for setup in session.setups.values()):
         return [approach, f"Write down what the instrument shows, with its sign. {empty}"]
-    untouched = "During a setup, do not touch the bezel of the gauge or what holds it."
-    if any(setup.zero == "free" for setup in session.setups.values()):
-        untouched = (
-            "After you have set the gauge zero, do not touch the bezel, the stand or the arm of "
-            "the gauge."
-        )
+    is_set = any(setup.zero == "free" for setup in session.setups.values())
+    begin = "After you have set the gauge zero" if is_set else "During a setup"
+    untouched = f"{begin}, do not touch the bezel of the gauge or what holds it."
     return [
         approach,
         _contact_rule(session, motions),
@@ -198,7 +223,7 @@ def _contact_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
         return f"{rule}."
     return (
         f"{rule}, except during the motions that the setup names. Hold the plunger up during these "
-        "motions, then lower it onto the rod. Do not touch the stand or the bezel."
+        "motions, then lower it again. Do not touch the bezel of the gauge or what holds it."
     )
 
 

@@ -10,7 +10,12 @@ from orthocal.measurement.motion.guidance import dial_zero, range_of_expected, s
 from orthocal.measurement.motion.stops import SetupMotion, Stop
 from orthocal.observation.gauge_noise import usual_difference
 from orthocal.output.sheet.coordinates import show_length, show_number, shown_place
-from orthocal.output.sheet.gauge_position import ABOUT_ALONG, GaugePosition, name_tip
+from orthocal.output.sheet.gauge_position import (
+    ABOUT_ALONG,
+    DIAL_LENGTH,
+    GaugePosition,
+    name_tip,
+)
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import has_dial, mounting_steps, probing_direction
@@ -82,9 +87,9 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         target = f"rod {gauge.rod.name} of leg {gauge.leg.name}"
         reach = gauge.hinge_distances / MM
         contact = (
-            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
-            "from the hinge on the slide. Then the rod slides past the tip: during the setup the "
-            f"distance becomes {reach.min():.0f} to {reach.max():.0f} mm. "
+            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {_from_hinge(gauge)}. Then the "
+            "rod slides past the tip: during the setup the distance becomes "
+            f"{reach.min():.0f} to {reach.max():.0f} mm. "
         )
         if gauge.tip is not None and gauge.tip.edge is None:
             contact += "Align the ball by eye: half a millimetre is good enough. "
@@ -103,6 +108,15 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "enter every reading of this setup with the opposite sign.",
     )
+
+
+def _from_hinge(gauge: GaugePosition) -> str:
+    """Distance of the contact from the hinge at the drive, now and in the mechanical zero."""
+    at, at_zero = gauge.hinge_distances[gauge.aligned], gauge.zero_distance
+    words = f"{at / MM:.1f} mm from the hinge on the {gauge.driven_noun}"
+    if at_zero is None or abs(at - at_zero) < VISIBLE:
+        return words
+    return f"{words} (at the mechanical zero it would be {at_zero / MM:.1f} mm)"
 
 
 def _around_ball(session: Session, setup: Setup, begin: Stop) -> str:
@@ -132,9 +146,11 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
     if setup.zero == "known" or not has_dial(setup.sensor):
         return set_dial(session, setup.name)
     again = " Set it again where the table says so." * (first.role == "subtracted")
+    held_by = "stand" if mounting_steps(setup.sensor) is None else "holder"
+    held_by = "post" if isinstance(setup.sensor, BallBar) else held_by
     return (
         f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Push "
-        "the stand lightly and release it: the hand must return to "
+        f"the {held_by} lightly and release it: the hand must return to "
         f"{dial_zero(session.gauges[setup.gauge])} within one step."
     )
 
@@ -142,6 +158,14 @@ def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
 def setup_warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> str:
     """Paragraphs with warnings before the readings of a setup."""
     texts = []
+    if gauge.rod is not None and gauge.facing is not None:
+        rod, room = gauge.facing
+        texts.append(
+            f"The gauge is between rods {gauge.rod.name} and {rod.name}, with {room / MM:.0f} mm "
+            f"for dial and plunger. A dial indicator needs about {DIAL_LENGTH / MM:.0f} mm. If "
+            f"yours does not fit, touch rod {rod.name} instead, from the same side: change "
+            "`touches` in session.yaml and run `orthocal sheet`."
+        )
     if gauge.near_hinge is not None:
         texts.append(
             f"The tip comes within {gauge.near_hinge / MM:.1f} mm of the middle of a hinge. Check "

@@ -83,8 +83,7 @@ PLACE_TOLERANCES = {BallBar.kind: ("centre_tolerance_mm", "length_tolerance_mm")
 HOW_TO = {
     LegIndicator.kind: (
         "Dial at a leg: mount it in the first posture of its setup, where the sheet states the "
-        "place of contact. The stated part of the length from the slide is that at the mechanical "
-        "zero."
+        "place of contact. The stated part of its length is that at the mechanical zero."
     ),
     BallBar.kind: (
         "Ball bar: fix one ball on the table at the stated place and clamp the other to the tool. "
@@ -450,7 +449,7 @@ def _setups(plan: MeasuringPlan) -> RenderableType:
     rows = [
         (
             setup.name,
-            describe_mounting(setup.sensor, aligned_at[setup.name]),
+            describe_mounting(s.robot, setup.sensor, aligned_at[setup.name], brief=True),
             " ".join(_posture(r, s.robot) for r in s.readings if r.setup == setup.name),
         )
         for setup in list(s.setups.values())[:MOST_LISTED]

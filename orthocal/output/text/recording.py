@@ -25,7 +25,6 @@ from orthocal.measurement.motion.approach import (
 from orthocal.measurement.motion.guidance import (
     describe_mounting,
     guide,
-    is_displaced,
     set_dial,
     shown_tool,
 )
@@ -257,10 +256,8 @@ class RecordingText:
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
-        at_zero = hasattr(sensor, "leg") and not is_displaced(sensor)
-        place = "Place at the mechanical zero" if at_zero else "Place"
-        measured = describe_mounting(sensor, aligned)
-        parts = [f"{place}: {measured}", self._stand(name), _gauge(session, setup)]
+        measured = describe_mounting(session.robot, sensor, aligned)
+        parts = [f"Place: {measured}", self._stand(name), _gauge(session, setup)]
         gauge, gauge_or_stand = _name_gauge(setup), _name_gauge(setup, stand=True)
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
@@ -313,7 +310,8 @@ class RecordingText:
         side = name_direction(guidance.contacts[setup][1].direction)
         distances = hinge_distances(self._session, setup, guidance)
         if distances:
-            at = f"{distances[aligned] / MM:.1f} mm from the hinge on the slide"
+            driven = self._session.robot.driven_noun
+            at = f"{distances[aligned] / MM:.1f} mm from the hinge on the {driven}"
         else:
             point, origin = guidance.contact_point(setup)
             place = ", ".join(format_fixed(v / MM, 1) for v in point)

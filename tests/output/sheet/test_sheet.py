@@ -123,7 +123,9 @@ def test_stated_contact_is_on_the_rod(small, page):
     found = re.search(r"contact point is at X([-\d.]+) Y([-\d.]+) Z([-\d.]+) mm", text)
     assert [float(v) for v in found.groups()] == pytest.approx(expected / MM, abs=ROUNDED_PLACE)
     assert "on the +y side of rod a of leg x. Point its plunger to -y." in text
-    assert "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from" in text
+    assert "leg x, gauge in y, at 0.5 of its length from the slide at the mechanical zero" in text
+    hinge = "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from the hinge"
+    assert f"{hinge} on the slide. Then" in text
 
 
 def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
@@ -145,7 +147,7 @@ def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
 
 
 def test_lateral_offset_in_the_alignment_posture_is_stated(small):
-    """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod."""
+    """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod and hinge."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
     session = replace(small, readings=tuple(readings))
     text = words(sections(etree.HTML(sheet_files(session)["sheet.html"]))[0])
@@ -162,6 +164,10 @@ def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     found = re.search(r"with its centre (\d+\.\d) mm off the centre line, towards", text)
     assert float(found[1]) == pytest.approx(abs(aside), abs=ROUNDED_PLACE)
     assert abs(aside) > 1.0
+    at_zero = r"\(at the mechanical zero it would be 125\.0 mm\)"
+    found = re.search(rf"([\d.]+) mm from the hinge on the slide {at_zero}", text)
+    assert float(found[1]) == pytest.approx(np.linalg.norm(axis - root) / MM, abs=0.5)
+    assert abs(float(found[1]) - 125.0) > 10.0
 
 
 def test_alignment_posture_comes_before_the_first(small):
@@ -234,6 +240,8 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert "After you have set the gauge zero, do not touch the bezel" in text
     assert "controller: {offsets_mm: [0, 0, 0]}" in text
     assert words(page.findall(".//code")[-1]) == "orthocal calibrate . --out DIRECTORY"
+    assert "machine.yaml (orthocal new DIRECTORY --again)" in text
+    assert "measures (section: at the mechanical zero)" in text
     assert "`" not in text
 
 
@@ -262,7 +270,7 @@ def test_sheet_after_a_calibration_has_shifted_travel_and_ends_with_validation(s
     for active in ([0.0] * 3, [1e-3, 2e-3, 0.0]):
         session = small.with_controller(np.array(active))
         text = sheet_files(session)["sheet.html"].replace("−", "-")
-        assert ("A few mm are normal" in text) == (not any(active))
+        assert ("A smaller difference is normal" in text) == (not any(active))
         limits = (
             "-149.0 to 71.0 mm; y_slide -67.0 to 153.0 mm",
             "-150.0 to 70.0 mm; y_slide -65.0",
@@ -307,6 +315,44 @@ def test_tip_near_a_hinge_causes_a_warning(small):
     setups = {**small.setups, "xy": replace(small.setups["xy"], sensor=near)}
     text = words(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]).find("body"))
     assert text.count("of the middle of a hinge") == 1
+
+
+def test_a_gauge_between_two_rods_causes_a_warning(small):
+    """Rod b is 60 mm below rod a. The picture shows the dial between them."""
+    setup = small.setups["<b>yx"]
+    for direction, between in (("y", False), ("z", False), ("-z", True)):
+        sensor = replace(setup.sensor, direction=direction)
+        plan = replace(small, setups={**small.setups, "<b>yx": replace(setup, sensor=sensor)})
+        section = sections(etree.HTML(sheet_files(plan)["sheet.html"]))[0]
+        warning = "between rods a and b, with 52 mm for dial and plunger"
+        assert (warning in words(section)) is between
+        assert ("touch rod b instead" in words(section)) is between
+        circles = section.findall(".//svg")[1].findall(".//circle")
+        rods = [circle for circle in circles if circle.get("fill") in ("#9cc7e6", "#e3e7ec")]
+        (dial,) = (circle for circle in circles if circle.get("fill") == "#fff")
+        assert len(rods) == 2
+        for rod in rods:
+            (x, y, r), (a, b, s) = (
+                [float(circle.get(key)) for key in ("cx", "cy", "r")] for circle in (dial, rod)
+            )
+            assert np.hypot(x - a, y - b) > r + s
+
+
+def test_a_machine_with_cranks_is_described_without_slides(root, tmp_path):
+    (tmp_path / "plan.yaml").write_text(
+        f"robot: {root / 'examples/fivebar'}\n"
+        "postures: {zero: {tcp_mm: [0, 0]}, out: {tcp_mm: [10, 0]}}\n"
+        "setups: {up: {leg: left, touches: a, tip: {ball: {radius_mm: 1.5}}, "
+        "direction: [0, 0, 1], section: {fraction: 0.5}}}\n"
+    )
+    text = words(etree.HTML(sheet_files(load_plan(tmp_path / "plan.yaml"))["sheet.html"]))
+    assert "Jog each joint a little counterclockwise as seen from +z. Its number must grow" in text
+    assert "leg left, gauge in z, at 0.5 of its length from the crank at the mechanical" in text
+    assert "100.0 mm from the hinge on the crank" in text
+    assert "Correct the zero in the controller" in text
+    assert "or the others in fivebar.urdf and fivebar.yaml." in text
+    for words_of_slides in ("slide ", "outwards", "machine.yaml", "few mm"):
+        assert words_of_slides not in text
 
 
 def test_sessions_have_sheets(experiment_2):
@@ -416,12 +462,15 @@ def test_tables_of_readings_are_as_wide_as_the_text(browser, small, tmp_path):
 
 
 def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
-    """As the front page does, with offsets and backlash that are compensated."""
+    """As the front page does, with offsets and backlash that are compensated.
+
+    Tool coordinates and names of programs are in one line.
+    """
     make_robot(SMALL, tmp_path / "mine", counting=COUNTING)
     postures, setups = "", ""
     for k, leg in enumerate("xyz"):
         for i in range(9):
-            position = [15 * i - 60 if axis == k else 0 for axis in range(3)]
+            position = [15 * i - 60.125 if axis == k else 0 for axis in range(3)]
             postures += f"  {leg}{i}: {{tcp_mm: {position}}}\n"
     for leg, direction in permutations("xyz", 2):
         read = ", ".join(f"{leg}{i}" for i in range(9))
@@ -436,6 +485,17 @@ def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
     approached = [replace(r, conditions=Conditions(approach="pnp")) for r in plan.readings]
     plan = replace(plan, readings=tuple(approached))
     with printed_sheet(browser, plan, tmp_path) as page:
+        lines = page.evaluate(
+            """() => {
+                 const parts = 'td:nth-child(4), td:last-child:not(.note), p code';
+                 return [...document.querySelectorAll(parts)].map((part) => {
+                   const range = document.createRange();
+                   range.selectNodeContents(part);
+                   return [part.textContent, range.getClientRects().length];
+                 });
+               }"""
+        )
+        right = page.evaluate("document.documentElement.scrollWidth")
         front, *heights = page.evaluate(
             """() => {
                  const boxes = [...document.querySelectorAll('section[id]')].map(
@@ -445,6 +505,9 @@ def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
         )
     assert len(heights) == 6
     assert max(front, *heights) <= PAGE_HEIGHT
+    assert right <= round(PRINTED)
+    assert {"-60.125, 0, 0".replace("-", "−"), "01-yx.ngc"} < {text for text, _ in lines}
+    assert [text for text, count in lines if count != 1] == []
 
 
 def test_a_displaced_tip_is_described_in_its_alignment_posture(small, tmp_path):
@@ -460,5 +523,7 @@ def test_a_displaced_tip_is_described_in_its_alignment_posture(small, tmp_path):
     recorded = run_orthocal(tmp_path, "record", path.parent, typed="quit\n").stdout
     for text in (sheet["sheet.html"], program, recorded):
         assert "aligned in" in text
+        assert "at 0.4 of its length from the slide at the mechanical zero" in " ".join(
+            text.split()
+        )
         assert "centre line by" not in text
-        assert not re.search("(?i)at the mechanical zero: leg", text)
