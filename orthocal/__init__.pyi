@@ -1,5 +1,7 @@
 # The public names and their modules, for type checkers and for __init__.py, which reads this list.
 
+__all__: list[str]
+
 from orthocal.assessment.adjustment_plan import AdjustmentPlan as AdjustmentPlan
 from orthocal.assessment.adjustment_plan import plan_adjustments as plan_adjustments
 from orthocal.assessment.assess import assess as assess

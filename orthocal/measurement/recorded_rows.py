@@ -176,12 +176,18 @@ def find_dropped(session: Session, changes: Iterable[Change]) -> dict[int, list[
         changes: All changes that the journal contains.
     """
     _, dropped = _replay(changes)
-    postures = {None, *session.postures}
-    return {
-        line: keys
-        for line, keys in dropped.items()
-        if all(k[0] in session.setups and postures.issuperset(k[1:3]) for k in keys)
-    }
+    return {line: keys for line, keys in dropped.items() if not find_unknown(session, keys)}
+
+
+def find_unknown(session: Session, keys: Iterable[ReadingKey]) -> str:
+    """First setup or posture of rows that the session does not have; "" without any."""
+    for setup, posture, minus, *_ in keys:
+        if setup not in session.setups:
+            return f"setup '{setup}'"
+        for name in (posture, minus):
+            if name is not None and name not in session.postures:
+                return f"posture '{name}'"
+    return ""
 
 
 FORMAT = "orthocal/recording/1"

@@ -40,6 +40,7 @@ from orthocal.measurement.recorded_rows import (
     change_rows,
     find_dropped,
     find_pending,
+    find_unknown,
     read_lines,
     recorded_rows,
 )
@@ -405,6 +406,8 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
                 rows = change_rows(rows, change)
             except SessionError as e:
                 raise OrthocalError(f"does not fit {csv.name}: {e.problem}", where=where) from None
+            if unknown := find_unknown(session, change.rows):
+                raise OrthocalError(f"does not fit the session: it has no {unknown}", where=where)
         if pending:
             table = _table(rows, session)
             _write(csv, table)

@@ -584,7 +584,7 @@ def drive_keys(
     """Keys of a session with a value of each drive, such as "offsets_mm: [0, 0]", by their units.
 
     Args:
-        quantity: First part of the keys: offsets or backlash.
+        quantity: First part of the keys: offsets, backlash or home_offset.
         drives: The drives.
         values: Value of each drive, [m, rad]; 0 by default.
     """

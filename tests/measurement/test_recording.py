@@ -392,6 +392,7 @@ def test_a_line_without_an_end_was_never_accepted(plan, monkeypatch):
 
 
 READ = '{"done": "read", "rows": [["yx", "zero", null, 1]], "reading_mm": 0.1, "at": "", '
+ADDED = READ.replace("read", "added", 1).replace("1]]", '1], ["yx", "x_max", null, 9]]')
 DIGESTS = '"before": "BEFORE", "after": ""}'
 
 
@@ -410,6 +411,11 @@ DIGESTS = '"before": "BEFORE", "after": ""}'
         ("HEAD" + "[" * 70_000 + "\n", "is not a line of a recording"),
         ("HEAD" + "x" * 70_000, "is not a line of a recording"),
         ("HEAD" + READ.replace("yx", "no") + DIGESTS + "\n", r":2: does not fit readings\.csv"),
+        (
+            "HEAD" + ADDED.replace('"yx", "x_max"', '"no", "x_max"') + DIGESTS + "\n",
+            ":2: .* it has no setup 'no'",
+        ),
+        ("HEAD" + ADDED.replace("x_max", "far") + DIGESTS + "\n", ":2: .* it has no posture 'far'"),
     ],
 )
 def test_a_damaged_journal_is_refused_and_nothing_changes(plan, content, message):

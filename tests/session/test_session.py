@@ -21,6 +21,7 @@ from orthocal import (
     plan_readings,
     write_session,
 )
+from orthocal.effects.compensation import JointTrim
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import build_problem
 from orthocal.session.session import split_label
@@ -120,6 +121,24 @@ def test_a_loaded_session_is_the_written_one(tmp_path, example):
     for name, posture in session.postures.items():
         assert np.abs(again.postures[name].drives - posture.drives).max() < CLOSED_FORM
     assert (again.controller_offsets is None) == (session.controller_offsets is None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"compensation": (JointTrim(1e-5),) * 4}, "has 4 compensations of joints; expected 3"),
+        ({"compensation": (JointTrim(1e-5),)}, "has 1 compensations of joints; expected 3"),
+        (
+            {"compensation": (JointTrim(1e-5, home=0.1), *(JointTrim(1e-5),) * 2)},
+            "has 1 home positions of joints; expected 3",
+        ),
+        ({"gauges": {}}, "expected at least 1 item"),
+    ],
+)
+def test_an_incomplete_session_is_not_written(tmp_path, raw_cycles, change, message):
+    with pytest.raises(SessionError, match=message):
+        write_session(replace(raw_cycles, **change), tmp_path / "copy")
+    assert not (tmp_path / "copy/session.yaml").exists()
 
 
 def test_a_name_that_would_not_load_is_not_written(tmp_path, raw_cycles):

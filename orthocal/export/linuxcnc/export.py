@@ -157,7 +157,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     approximation = approximate(
         calibration,
         within=DEFAULT_TOLERANCE if options.within is None else options.within,
-        tool=options.tool or (0.0, 0.0, 0.0),
+        tool=(0.0, 0.0, 0.0) if options.tool is None else options.tool,
         half_side=options.half_side,
         payload=options.payload,
     )

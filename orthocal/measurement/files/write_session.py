@@ -69,7 +69,7 @@ def session_document(session: Session) -> dict[str, Any]:
         "title": session.title,
         "source": session.source,
         "seed": None if session.seed is None else int(session.seed),
-        "gauges": {} if "" in gauges else gauges,
+        "gauges": None if "" in gauges else gauges,
         "gauge": gauges.get("", {}),
         "postures": {p.name: _posture_document(p, session.robot) for p in postures},
         "payload_kg": _payload(session) or None,
@@ -79,7 +79,10 @@ def session_document(session: Session) -> dict[str, Any]:
         "setups": _setup_documents(session),
         "readings": "readings.csv",
     }
-    return {key: value for key, value in entries.items() if value not in (None, "", {})}
+    stated = {"gauges", "postures", "setups"}  # an empty one is refused
+    return {
+        k: v for k, v in entries.items() if v not in (None, "", {}) or (v == {} and k in stated)
+    }
 
 
 def _setup_documents(session: Session) -> dict[str, dict[str, Any]]:
@@ -172,7 +175,12 @@ def _calibration_document(session: Session) -> dict[str, Any]:
 
 
 def _controller_document(session: Session) -> dict[str, Any]:
-    """Offsets of prismatic drives in mm, of revolute drives in mrad, and the compensation."""
+    """Offsets of prismatic drives in mm, of revolute drives in mrad, and the compensation.
+
+    Raises:
+        SessionError: If it does not state the compensation or the home position of each drive.
+    """
+    _require_complete(session)
     document: dict[str, Any] = {}
     stated: dict[str, Sequence[float]] = {}
     if session.controller_offsets is not None:
@@ -181,9 +189,10 @@ def _controller_document(session: Session) -> dict[str, Any]:
             document.setdefault(key, []).append(tidy(float(offset) / MM))
     if any(joint.backlash or joint.table is None for joint in session.compensation):
         stated["backlash"] = [joint.backlash for joint in session.compensation]
-    stated["home_offset"] = home_positions(session.compensation) or ()
+    if (homes := home_positions(session.compensation)) is not None:
+        stated["home_offset"] = homes
     for quantity, values in stated.items():
-        for drive, value in zip(session.robot.drives, values, strict=False):
+        for drive, value in zip(session.robot.drives, values, strict=True):
             key = f"{quantity}_{drive.joint_unit}"
             document.setdefault(key, []).append(tidy(value / drive.joint_size))
     if any(joint.table is not None for joint in session.compensation):
@@ -196,6 +205,19 @@ def _controller_document(session: Session) -> dict[str, Any]:
     if any(session.controller_origin):
         document["origin_mm"] = [tidy(v / MM) for v in session.controller_origin]
     return document
+
+
+def _require_complete(session: Session) -> None:
+    """Refuse a compensation, or home positions, of some drives only.
+
+    Raises:
+        SessionError: If a drive has none.
+    """
+    joints, count = session.compensation, len(session.robot.drives)
+    homes = sum(joint.home is not None for joint in joints)
+    for number, noun in ((len(joints), "compensations"), (homes, "home positions")):
+        if number not in (0, count):
+            raise SessionError(f"has {number} {noun} of joints; expected {count}, one per drive")
 
 
 def firmware_document(settings: DeltaSettings) -> dict[str, Any]:
