@@ -8,7 +8,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.options import read_temperatures, split_effects, state_tolerances
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError, errors_at
 from orthocal.io.files import exists
 from orthocal.text import spans
 
@@ -64,8 +64,6 @@ def _state_effects(session: orthocal.Session, text: str | None) -> orthocal.Sess
     Raises:
         ParameterError: If an effect does not exist.
     """
-    from orthocal.robot.parameters import errors_at
-
     names = split_effects(text)
     with errors_at("--effects"):
         return session if names is None else session.with_effects(names)

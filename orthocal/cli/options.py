@@ -15,7 +15,7 @@ from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
 import orthocal
-from orthocal.errors import ParameterError
+from orthocal.errors import ParameterError, errors_at
 from orthocal.text import shorten
 from orthocal.units import MM
 
@@ -417,8 +417,6 @@ def state_tolerances(session: orthocal.Session, texts: Sequence[str] | None) -> 
     Raises:
         ParameterError: If a text is malformed or selects no error, or a tolerance is implausible.
     """
-    from orthocal.robot.parameters import errors_at
-
     with errors_at("--tolerance"):
         return session.with_tolerances(read_tolerances(texts, session.robot))
 

@@ -28,7 +28,7 @@ from orthocal.cli.options import (
 from orthocal.cli.overwriting import require_new_session, write_plan
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import note_contradictions, sheet_or_problem
-from orthocal.errors import ParameterError
+from orthocal.errors import ParameterError, errors_at
 from orthocal.text import quote_path
 from orthocal.units import MM
 
@@ -136,7 +136,6 @@ def _choose(
     from orthocal.effects.compensation import home_positions, with_homes
     from orthocal.effects.loading import with_effects
     from orthocal.kinematics.workspace import box_workspace
-    from orthocal.robot.parameters import errors_at
 
     session, robot = load_robot_or_session(subject)
     measured = None if session is None else orthocal.load_session(subject)

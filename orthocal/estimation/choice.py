@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from orthocal.arguments import require_kind, require_names, require_numbers
-from orthocal.errors import ParameterError
+from orthocal.errors import ParameterError, errors_at
 from orthocal.estimation.selection import (
     KnownWithStd,
     KnownWithTolerance,
@@ -17,7 +17,7 @@ from orthocal.estimation.selection import (
     select_parameters,
 )
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
-from orthocal.robot.parameters import ParameterSet, errors_at
+from orthocal.robot.parameters import ParameterSet
 from orthocal.session.session import Purpose, Session
 from orthocal.units import read_limit
 

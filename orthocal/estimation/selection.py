@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Mask
-from orthocal.errors import ParameterError
+from orthocal.errors import ParameterError, errors_at
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
 from orthocal.robot.parameters import (
     Parameter,
     ParameterSet,
-    errors_at,
     require_prior_std,
     split_assignment,
 )

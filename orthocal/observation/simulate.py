@@ -20,13 +20,13 @@ from orthocal.effects.adjustment import (
     require_adjustment,
     subtract_amounts,
 )
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError, errors_at
 from orthocal.io.documents import Keys, Number, parse_number, read_yaml, validate
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, split_assignment
+from orthocal.robot.parameters import Parameter, ParameterSet, split_assignment
 from orthocal.robot.redundant import require_independent_rows
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm

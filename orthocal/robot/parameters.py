@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -19,7 +18,7 @@ import numpy as np
 
 from orthocal.arguments import require_numbers
 from orthocal.arrays import Array
-from orthocal.errors import ParameterError
+from orthocal.errors import ParameterError, errors_at
 from orthocal.text import composed
 from orthocal.units import EDGE_UNITS, UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit, tidy
 
@@ -533,15 +532,6 @@ def suggest(name: str, names: Iterable[str]) -> str:
     """Hint with similar names, for messages."""
     close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     return f"; did you mean {', '.join(close)}?" if close else ""
-
-
-@contextmanager
-def errors_at(where: str) -> Iterator[None]:
-    """Add the argument or key to parameter errors that do not name one."""
-    try:
-        yield
-    except ParameterError as e:
-        raise ParameterError(e.problem, where=e.where or where) from None
 
 
 def split_assignment(text: str, form: str, where: str) -> tuple[str, str]:
