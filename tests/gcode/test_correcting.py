@@ -478,6 +478,7 @@ PRINTED_MM = 0.0002
 """Rounding of ends and centres by rs274, four decimals, [mm]."""
 
 
+@pytest.mark.acceptance
 @pytest.mark.skipif(RS274 is None, reason="LinuxCNC's rs274 is not installed (linuxcnc-uspace)")
 @pytest.mark.parametrize("seed", range(6))
 def test_linuxcnc_interpreter_before_and_after_correction(seed, tmp_path):

@@ -94,6 +94,7 @@ def test_no_label_overlaps_another_or_the_border(plan, drawn):
             assert (middle + label.half <= (picture.width, picture.height)).all(), label.text
 
 
+@pytest.mark.acceptance
 def test_labels_in_a_browser_are_inside_their_boxes(drawn, tmp_path):
     """The real extent of the text, with the fonts that are installed."""
     pictures, svgs = drawn

@@ -444,6 +444,7 @@ def printed_sheet(browser, plan, folder):
         yield found.page
 
 
+@pytest.mark.acceptance
 def test_tables_of_readings_are_as_wide_as_the_text(browser, small, tmp_path):
     """With columns for approach, temperature and time, and for what a perfect machine shows."""
     plan = small.with_effects(("backlash", "thermal", "drift"))
@@ -461,6 +462,7 @@ def test_tables_of_readings_are_as_wide_as_the_text(browser, small, tmp_path):
     assert max(columns for _, columns in widths) == 12
 
 
+@pytest.mark.acceptance
 def test_a_setup_of_ten_readings_fits_on_a_page(browser, tmp_path):
     """As the front page does, with offsets and backlash that are compensated.
 
