@@ -41,7 +41,7 @@ class RecordedConditions:
         self._needed = needed_conditions(recording.session.robot)
         self.temperature = before.temperature
         self.is_unusual = False
-        """Whether the temperature that was typed last may be a mistake."""
+        """True if the temperature that was typed last may be a mistake."""
         typed = before.approach
         if typed is not None and find_approach_problem(typed, recording.session.robot):
             typed = None  # the robot has other drives now

@@ -212,7 +212,7 @@ class LinearModel:
 
     @property
     def corrections(self) -> tuple[tuple[bool, bool], ...]:
-        """Whether offsets are active in each session, and whether its controller compensates.
+        """Flags of each session: offsets are active, and the controller compensates.
 
         Settings of single towers are the offsets of a printer.
         """

@@ -98,7 +98,7 @@ class Stop:
     """Postures from whose readings the readings of this stop are subtracted."""
 
     def has(self, setup: Setup) -> bool:
-        """Whether the gauge of a setup is at this stop; without a reading it may not touch."""
+        """True if the gauge of a setup is at this stop; without a reading it may not touch."""
         if self.read is None:
             return self.place in (None, setup.sensor.place)
         return setup.name in self.read

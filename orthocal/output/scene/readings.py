@@ -159,7 +159,7 @@ def _deviation(row: Deviation | None, node: str) -> float:
 
 
 def _moves(contact: Contact) -> bool:
-    """Whether the contact of a gauge moves with the tool; the others are fixed in space."""
+    """True if the contact of a gauge moves with the tool; the others are fixed in space."""
     return contact.at_tool or contact.fixed is not None
 
 

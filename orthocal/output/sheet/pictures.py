@@ -291,7 +291,7 @@ def outline(points: Array) -> Array:
 
 
 def _is_inside(point: Array, corners: Array) -> bool:
-    """Whether a point is inside of a convex polygon with corners as of `outline`, shape (n, 2)."""
+    """True if a point is inside a convex polygon with corners as of `outline`, shape (n, 2)."""
     sides, away = np.roll(corners, -1, axis=0) - corners, point - corners
     return bool((sides[:, 0] * away[:, 1] > sides[:, 1] * away[:, 0]).all())
 
