@@ -19,7 +19,7 @@ from orthocal.assessment.words.adjustment import (
 from orthocal.assessment.words.entries import describe_region
 from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError, OrthocalError
+from orthocal.errors import OrthocalError
 from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.output.text.answer import render_next
@@ -46,7 +46,7 @@ def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -
         return Text(f"Not planned: {decision.headline}")
     try:
         return render_plan(plan_adjustments(calibration), saved=saved)
-    except (OrthocalError, ClosureError) as e:
+    except OrthocalError as e:
         return Text(f"The adjustments cannot be planned: {e}.")
 
 
