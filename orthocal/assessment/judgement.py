@@ -357,14 +357,13 @@ def _independent_contrasts(
 
 def _describe_order(session: Session) -> list[Finding]:
     """Finding about joined sessions that were not given in the order of measuring."""
-    model = linear_model(session)
-    last = model.labels[model.order[-1]]
-    if last == model.labels[-1]:
+    sessions = linear_model(session).sessions
+    given, last, times = sessions.labels[-1], sessions.ordered_labels[-1], sessions.times
+    if last == given:
         return []
-    given, times = model.labels[-1], model.times
     if times and times[last] > times[given]:
         return [describe_wrong_time(given, last)]
-    corrections = dict(zip(model.labels, model.corrections, strict=True))
+    corrections = dict(zip(sessions.labels, sessions.corrections, strict=True))
     kind: Correction = (
         "compensation" if corrections[given][0] == corrections[last][0] else "offsets"
     )

@@ -6,11 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
@@ -27,12 +25,12 @@ from orthocal.hypotheses.hypothesis import (
     row_products,
     sparse_rows,
 )
+from orthocal.hypotheses.joined_sessions import JoinedSessions
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
-from orthocal.measurement.joining import settings_of_sessions
 from orthocal.observation.gauge_noise import assumed_sigma
 from orthocal.observation.observations import Observations, build_observations
-from orthocal.session.session import Session, split_label
+from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros, zero_shares
 
 MAX_JACOBIAN = 2_000_000
@@ -110,11 +108,12 @@ class LinearModel:
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.problem = problem.with_noise_ratio(sigmas / self.sigma)
         self.dof = o.size - o.n_free_zeros
-        self.labels, self.session_of_entry = label_sessions(session, o.setup)
+        self.sessions = JoinedSessions.of(session, o.setup)
         self.reference = self.problem.active_theta.copy()
         """Free parameters of the reference, shape (n_free,), [SI]: the controller corrects its
         offsets and backlashes as stated. It is the mean of the prior."""
-        for drive, backlash in zip(session.robot.drives, self.compensated.max(axis=0), strict=True):
+        compensated = self.sessions.compensated.max(axis=0).tolist()
+        for drive, backlash in zip(session.robot.drives, compensated, strict=True):
             if (name := f"{drive.name}.backlash") in free:
                 self.reference[self.problem.free.index(name)] = backlash
         self._shares = zero_shares(o)
@@ -162,32 +161,6 @@ class LinearModel:
         drives = self.problem.robot.drives
         return {d.name: place[f"{d.name}.offset"] for d in drives if f"{d.name}.offset" in place}
 
-    @property
-    def active(self) -> Array:
-        """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
-        session = self.problem.session
-        return self._of_sessions([session.active_during(name) for name in session.setups])
-
-    @property
-    def compensated(self) -> Array:
-        """Backlashes that the controller compensates as stated, (n_sessions, n_drives), [m, rad].
-
-        They are 0 if not stated.
-        """
-        session = self.problem.session
-        none = [0.0] * len(session.robot.drives)
-        by_setup = [
-            session.compensation if s.compensation is None else s.compensation
-            for s in session.setups.values()
-        ]
-        return self._of_sessions([[t.lost_motion for t in c] or none for c in by_setup])
-
-    def _of_sessions(self, by_setup: Sequence[ArrayLike]) -> Array:
-        """Values of the first setup of each session, from those of all setups."""
-        setup_of_entry = self.problem.observations.setup
-        first_entries = [np.argmax(self.session_of_entry == k) for k in range(len(self.labels))]
-        return np.array([by_setup[setup_of_entry[i]] for i in first_entries])
-
     @cached_property
     def has_shifts(self) -> bool:
         """True if the machine may differ between readings, which needs their Jacobian.
@@ -195,45 +168,8 @@ class LinearModel:
         In a large single session it may not, because that would take much memory.
         """
         small = self.problem.observations.size * self.problem.n_free <= MAX_JACOBIAN
-        several = len(self.labels) > 1 or bool(self.compensated.any())
+        several = len(self.sessions.labels) > 1 or bool(self.sessions.compensated.any())
         return several or (small and bool(self.offsets))
-
-    @property
-    def order(self) -> Indices:
-        """Sessions in the order of measuring, shape (n_sessions,).
-
-        The times of the readings determine the order if all readings state them. Without times, or
-        at equal times, sessions with `corrections` come later; all others have the order in which
-        they were joined.
-        """
-        times = self.times or dict.fromkeys(self.labels, datetime.min.replace(tzinfo=UTC))
-        keys = [(times[n], c) for n, c in zip(self.labels, self.corrections, strict=True)]
-        return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
-
-    @property
-    def corrections(self) -> tuple[tuple[bool, bool], ...]:
-        """Flags of each session: offsets are active, and the controller compensates.
-
-        Settings of single towers are the offsets of a printer.
-        """
-        settings = settings_of_sessions(self.problem.session)
-        towers = [n in settings and settings[n].corrects_towers for n in self.labels]
-        offsets, backlashes = self.active.tolist(), self.compensated.tolist()
-        rows = zip(offsets, towers, backlashes, strict=True)
-        return tuple((any(values) or tower, any(others)) for values, tower, others in rows)
-
-    @property
-    def times(self) -> dict[str, datetime]:
-        """Time of the first reading of each joined session; empty unless all readings state it."""
-        session = self.problem.session
-        times: dict[str, list[datetime]] = {}
-        for r in session.readings:
-            if not session.joined or r.conditions is None or r.conditions.time is None:
-                return {}
-            label, _ = split_label(r.setup, joined=True)
-            time = r.conditions.time
-            times.setdefault(label, []).append(time.replace(tzinfo=time.tzinfo or UTC))
-        return {label: min(of_session) for label, of_session in times.items()}
 
     @cached_property
     def to_entries(self) -> Sparse:
@@ -346,7 +282,7 @@ class LinearModel:
             shape (n_entries,).
         """
         if not shifts:
-            machine_of_entry = np.zeros(self.session_of_entry.size, dtype=np.int64)
+            machine_of_entry = np.zeros(self.problem.observations.size, dtype=np.int64)
             return (self.reference + theta * self.problem.theta_scale)[None], machine_of_entry
         shifted = np.column_stack([s.entries for s in shifts])
         combinations, machine_of_entry = np.unique(shifted, axis=0, return_inverse=True)
@@ -736,23 +672,3 @@ def _refer_to_most_corrected(session: Session) -> Session:
         key=lambda offsets: (float(np.abs(offsets).max()), *offsets.tolist()),
     )
     return replace(session, controller_offsets=largest)
-
-
-def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], Indices]:
-    """Names of joined sessions, and the session of each entry.
-
-    Args:
-        session: The session.
-        setup: Setup of each entry, shape (n_entries,).
-
-    Returns:
-        Names of the sessions with readings, or a single "" without joined sessions; and for each
-        entry the index of its session among them, shape (n_entries,).
-    """
-    if not session.joined:
-        return ("",), np.zeros(setup.size, dtype=np.int64)
-    label_of_setup = session.labels
-    with_readings = {label_of_setup[i] for i in np.unique(setup)}
-    labels = tuple(n for n in dict.fromkeys(label_of_setup) if n in with_readings)
-    place = np.array([labels.index(n) if n in labels else -1 for n in label_of_setup])
-    return labels, place[setup]

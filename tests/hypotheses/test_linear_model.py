@@ -30,8 +30,8 @@ def points(model, rng, *, unreachable=()):
     """Machines with errors of half their tolerances; the last two have machine shifts."""
     start, n = model.problem.active_passive, model.problem.n_free
     changes = [
-        MachineShift(model.session_of_entry == 1, rng.normal(size=n)),
-        MachineShift(model.session_of_entry == 0, 0.3 * rng.normal(size=n)),
+        MachineShift(model.sessions.of_entry == 1, rng.normal(size=n)),
+        MachineShift(model.sessions.of_entry == 0, 0.3 * rng.normal(size=n)),
     ]
     return [
         LinearisationPoint(
@@ -62,7 +62,7 @@ def test_several_machines_are_linearised_like_single_ones(model, unreachable, mo
 
 def test_a_machine_shift_changes_the_readings_of_its_sessions(model):
     plain, _, changed, _ = points(model, np.random.default_rng(3))
-    later = model.session_of_entry == 1
+    later = model.sessions.of_entry == 1
     given = LinearisationPoint(plain.theta, changed.shifts, plain.start)
     without, found = model.linearise_all([plain, given], keep_jacobian=True)
     assert np.array_equal(found.jacobian[~later], without.jacobian[~later])

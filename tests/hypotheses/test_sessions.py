@@ -29,13 +29,10 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.effects.compensation import JointTrim
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
-from orthocal.hypotheses.families.sessions import (
-    divide_sessions,
-    enter_backlash_wrongly,
-    enter_wrongly,
-)
+from orthocal.hypotheses.families.sessions import enter_backlash_wrongly, enter_wrongly
 from orthocal.hypotheses.family_scores import list_families
 from orthocal.hypotheses.hypothesis import Rows
+from orthocal.hypotheses.joined_sessions import divide_sessions
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.hypotheses.search import _nearly_as_likely, _Search, find_anomalies
 from orthocal.measurement.joining import join_sessions
@@ -423,7 +420,7 @@ def test_no_machine_changes_by_a_hundred_tolerances(plan):
     session = measure_twice(plan, ENTERED, seed=0)
     model = LinearModel(session)
     column = model.at_reference(keep_jacobian=True).jacobian[:, model.problem.free.index(TILT)]
-    values = session.values + 200.0 * np.where(model.session_of_entry == 1, column, 0.0)
+    values = session.values + 200.0 * np.where(model.sessions.of_entry == 1, column, 0.0)
     explanations = [a.explanation for a in find_anomalies(session.with_values(values)).found]
     sizes = [abs(e.amount) for e in explanations if e.kind == "machine changed"]
     assert sizes
@@ -460,11 +457,11 @@ def at(session, day):
 def test_sessions_are_in_the_order_of_their_times(plan):
     """Without times, or at equal ones, those without active offsets come first."""
     sessions = [plan.with_controller(v) for v in (ENTERED, 0.0 * ENTERED, ENTERED)]
-    assert LinearModel(join_sessions(sessions)).order.tolist() == [1, 0, 2]
+    assert LinearModel(join_sessions(sessions)).sessions.order.tolist() == [1, 0, 2]
     timed = [at(s, day) for s, day in zip(sessions, (3, 2, 1), strict=True)]
-    assert LinearModel(join_sessions(timed)).order.tolist() == [2, 1, 0]
+    assert LinearModel(join_sessions(timed)).sessions.order.tolist() == [2, 1, 0]
     equal = [at(s, 1) for s in sessions]
-    assert LinearModel(join_sessions(equal)).order.tolist() == [1, 0, 2]
+    assert LinearModel(join_sessions(equal)).sessions.order.tolist() == [1, 0, 2]
 
 
 @pytest.mark.parametrize("backlash", [0.0, 0.01e-3])

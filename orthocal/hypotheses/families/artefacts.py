@@ -104,6 +104,7 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family:
     """A dimension that differs in several setups of a gauge from one session on."""
     session = rows.session
     label = dict(zip(session.setups, session.labels, strict=True))
+    labels = model.sessions.ordered_labels
     explained = []
     for dimension, changes in dimension_changes(model).items():
         gauges: dict[str, list[str]] = {}
@@ -111,8 +112,8 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family:
             _, gauge = split_label(session.setups[name].gauge, joined=session.joined)
             gauges.setdefault(gauge, []).append(name)
         for of_gauge in gauges.values():
-            for k in range(1, len(model.order)):
-                later = [model.labels[i] for i in model.order[k:]]
+            for k in range(1, len(labels)):
+                later = labels[k:]
                 setups = tuple(n for n in of_gauge if label[n] in later)
                 if not 1 < len(setups) < len(of_gauge):  # one setup: `_other_dimensions`
                     continue

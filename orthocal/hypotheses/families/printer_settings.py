@@ -21,8 +21,8 @@ from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
 from orthocal.hypotheses.families.artefacts import nuisance_columns
-from orthocal.hypotheses.families.sessions import divide_sessions
 from orthocal.hypotheses.hypothesis import Family, Patterns, sparse_rows
+from orthocal.hypotheses.joined_sessions import divide_sessions
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.measurement.joining import settings_of_sessions
 from orthocal.observation.sensor_groups import fixed_parameters
@@ -49,7 +49,7 @@ in `_to_vector`."""
 
 def changes_between_logs(model: LinearModel) -> Iterator[Family]:
     """Changes between the logs of a printer: of its active settings, or of its bed."""
-    if len(model.labels) > 1 and model.problem.session.firmware is not None:
+    if len(model.sessions.labels) > 1 and model.problem.session.firmware is not None:
         yield _wrong_settings(model)
         yield _moved_bed(model)
 
@@ -60,7 +60,7 @@ def _wrong_settings(model: LinearModel) -> Family:
     settings_of = settings_of_sessions(session)
     explanations, rows, changes = [], [], []
     before: DeltaSettings | None = None
-    for label in (model.labels[k] for k in model.order.tolist()):
+    for label in model.sessions.ordered_labels:
         stated = settings_of.get(label)
         if stated is None:
             continue
@@ -84,8 +84,8 @@ def _moved_bed(model: LinearModel) -> Family:
     columns = nuisance_columns(model)[fixed]
     label_of_row = [split_label(r.setup, joined=True)[0] for r in session.readings]
     explanations, groups = [], []
-    for sessions, apart in divide_sessions(model.order):
-        labels = tuple(model.labels[k] for k in sessions)
+    for sessions, apart in divide_sessions(model.sessions.order):
+        labels = tuple(model.sessions.labels[k] for k in sessions)
         later = np.isin(label_of_row, labels)
         sizes = [np.abs(columns[:, rows]).max(axis=1, initial=0.0) for rows in (later, ~later)]
         shared = np.minimum(*sizes) > model.sigma

@@ -15,6 +15,7 @@ from orthocal.arrays import Array, Indices
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
 from orthocal.hypotheses.hypothesis import Family, MachineShift, Rows
+from orthocal.hypotheses.joined_sessions import divide_sessions
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.session.session import Session
 
@@ -32,9 +33,6 @@ MAX_SCORED = 2_000_000
 """Most readings of all hypotheses of lost steps together. In larger sessions fewer readings are
 considered."""
 
-MAX_DIVIDED = 5
-"""Most sessions of which all divisions into two groups are considered, in any order."""
-
 DETECTABLE_CHANGE = 5.5
 """Smallest change, relative to its standard deviation, with clear evidence."""
 
@@ -51,9 +49,9 @@ Enter = Callable[[Array, Array], Iterator[Mistake]]
 
 def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
     """Wrongly entered numbers and changes of the machine; for a single session only backlash."""
-    yield from _of_controller(model, "backlash", model.compensated, enter_backlash_wrongly)
-    if len(model.labels) > 1:
-        yield from _of_controller(model, "offset", model.active, enter_wrongly)
+    yield from _of_controller(model, "backlash", model.sessions.compensated, enter_backlash_wrongly)
+    if len(model.sessions.labels) > 1:
+        yield from _of_controller(model, "offset", model.sessions.active, enter_wrongly)
         yield from _changed(model)
 
 
@@ -74,8 +72,8 @@ def _of_controller(
         return
     place = [model.problem.free.index(name) for name in names]
     explanations, shifts = [], []
-    previous = [np.zeros(len(drives)), *stated[model.order]]
-    for before, k in zip(previous, model.order.tolist(), strict=False):
+    previous = [np.zeros(len(drives)), *stated[model.sessions.order]]
+    for before, k in zip(previous, model.sessions.order.tolist(), strict=False):
         for kind, concerned, active in enter(before, stated[k]):
             explanations.append(
                 Explanation(
@@ -84,12 +82,12 @@ def _of_controller(
                     drives=tuple(drives[i] for i in concerned),
                     parameters=tuple(names[i] for i in concerned),
                     active=tuple(active.tolist()),
-                    sessions=tuple(filter(None, model.labels[k : k + 1])),
+                    sessions=tuple(filter(None, model.sessions.labels[k : k + 1])),
                 )
             )
             changes = dict(zip(place, stated[k] - active, strict=True))
             direction = _direction(model.problem, changes)
-            shifts.append(MachineShift(model.session_of_entry == k, direction))
+            shifts.append(MachineShift(model.sessions.of_entry == k, direction))
     yield Family.of(explanations, shifts=shifts)
 
 
@@ -188,10 +186,10 @@ def _steps(
         directions: Name of a parameter to its change, shape (n_free,), [prior std].
         offsets: Name of an offset to its drive.
     """
-    labels, active = model.labels, model.active
+    labels, active = model.sessions.labels, model.sessions.active
     explanations, shifts = [], []
-    for later, apart in divide_sessions(model.order):
-        sessions = np.isin(np.arange(len(labels)), later)
+    for later, apart in divide_sessions(model.sessions.order):
+        sessions = model.sessions.are_in(later)
         names = tuple(labels[k] for k in (later if apart else later[:1]))
         differences = np.abs(active[sessions][:, None] - active[~sessions]).max(axis=2)
         entered = bool(differences.min() > ROUNDING)
@@ -207,7 +205,7 @@ def _steps(
                     apart=apart,
                 )
             )
-            shifts.append(MachineShift(sessions[model.session_of_entry], direction))
+            shifts.append(MachineShift(sessions[model.sessions.of_entry], direction))
     return Family.of(explanations, shifts=shifts, known=False)
 
 
@@ -224,10 +222,10 @@ def lost_steps(model: LinearModel, rows: Rows) -> Iterator[Family]:
         return
     problem, explanations, shifts = model.problem, [], []
     plus, minus = problem.observations.plus, problem.observations.minus
-    session_of_row = model.session_of_entry[plus]
+    session_of_row = model.sessions.of_entry[plus]
     for drive, i in model.offsets.items():
         direction = _direction(problem, {i: 1.0})
-        for k, label in enumerate(model.labels):
+        for k, label in enumerate(model.sessions.labels):
             of_session = np.flatnonzero(session_of_row == k)
             for first in _first_readings(of_session, len(model.offsets) * rows.count):
                 later = of_session[of_session >= first]
@@ -261,32 +259,6 @@ def _first_readings(rows: Indices, size: int) -> Indices:
     return possible[::step]
 
 
-def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
-    """Divide sessions into two groups between which the machine may differ.
-
-    Args:
-        order: Sessions in the order of measuring, shape (n_sessions,).
-
-    Yields:
-        Sessions of one group, and False for all sessions from one on. With at most MAX_DIVIDED
-        sessions also True for any other group of at most half of them, because the order may be
-        stated wrongly.
-    """
-    sessions, n = order.tolist(), len(order)
-    for k in range(1, n):
-        yield sessions[k:], False
-    if n > MAX_DIVIDED:
-        return
-    steps = [set(sessions[k:]) for k in range(1, n)] + [set(sessions[:k]) for k in range(1, n)]
-    yielded: list[set[int]] = []
-    for size in range(1, n // 2 + 1):
-        for group in map(list, combinations(sessions, size)):
-            others = set(sessions) - set(group)
-            if set(group) not in steps and others not in yielded:
-                yielded.append(set(group))
-                yield group, True
-
-
 def detectable_changes(session: Session) -> dict[str, float]:
     """Smallest detectable change of each drive's offset between joined sessions.
 
@@ -300,16 +272,18 @@ def detectable_changes(session: Session) -> dict[str, float]:
         ClosureError: If the machine cannot reach a posture.
     """
     model = linear_model(session)
-    if len(model.labels) < 2 or model.dof < 1:
+    if len(model.sessions.labels) < 2 or model.dof < 1:
         return {}
     problem, offsets = model.problem, model.offsets
     about = model.at_reference(keep_jacobian=True)
     changes = dict.fromkeys(offsets, 0.0)
-    sessions = np.arange(len(model.labels))
-    steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
+    sessions = model.sessions
+    steps = [
+        sessions.are_in(later) for later, apart in divide_sessions(sessions.order) if not apart
+    ]
     for drive, i in offsets.items():
         direction = _direction(problem, {i: 1.0})
-        shifts = [MachineShift(later[model.session_of_entry], direction) for later in steps]
+        shifts = [MachineShift(later[sessions.of_entry], direction) for later in steps]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
         _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
         changes[drive] = DETECTABLE_CHANGE * float(stds.max())
