@@ -39,7 +39,8 @@ def run_here(folder, act, *, argv=("orthocal",), typed="", terminal=False):
     """Do something as a program does: in a folder, with streams and arguments of its own."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
     kind = Terminal if terminal else io.TextIOWrapper
-    stdin = kind(io.BytesIO(typed.encode()), encoding="utf-8")
+    lines = typed.encode() if isinstance(typed, str) else typed
+    stdin = kind(io.BytesIO(lines), encoding="utf-8")
     code = 0
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
         with (

@@ -176,6 +176,36 @@ def no_sensor_gains():
 
 
 @contextmanager
+def judged_once():
+    """Equal readings of files with equal tolerances are judged once."""
+    from orthocal.assessment import judgement
+
+    judge, judged = judgement.judge_session, {}
+
+    def judge_once(session):
+        parameters = session.robot.parameters
+        key = session.sha256, session.robot.sha256, str(parameters.stated), parameters.names
+        if not session.sha256:
+            return judge(session)
+        if key not in judged:
+            judged[key] = judge(session)
+        return judged[key]
+
+    with (
+        patch.object(judgement, "judge_session", judge_once),
+        patch.object(orthocal, "judge_session", judge_once),
+    ):
+        yield
+
+
+@pytest.fixture(scope="module")
+def judged_sessions():
+    """`judged_once` for all tests of a module."""
+    with judged_once():
+        yield
+
+
+@contextmanager
 def plans_of_few_candidates():
     """Plans of commands with few candidates and one start; tests/planning verify plans."""
     from uncompared import few_balls, few_machines, uncompared

@@ -18,7 +18,6 @@ from uncompared import uncompared
 
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
-from orthocal.assessment import judgement
 from orthocal.effects import registry as effect_registry
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.simulate import load_errors
@@ -26,30 +25,12 @@ from orthocal.planning import selection
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
-pytestmark = [pytest.mark.acceptance, pytest.mark.usefixtures("short_reports")]
+pytestmark = [
+    pytest.mark.acceptance,
+    pytest.mark.usefixtures("short_reports", "judged_sessions"),
+]
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def judged_once():
-    """Readings that several pages calibrate are judged once."""
-    judge, judged = judgement.judge_session, {}
-
-    def judge_once(session):
-        parameters = session.robot.parameters
-        key = session.sha256, session.robot.sha256, str(parameters.stated), parameters.names
-        if not session.sha256:
-            return judge(session)
-        if key not in judged:
-            judged[key] = judge(session)
-        return judged[key]
-
-    with (
-        patch.object(judgement, "judge_session", judge_once),
-        patch.object(orthocal, "judge_session", judge_once),
-    ):
-        yield
 
 
 @pytest.fixture(scope="module")

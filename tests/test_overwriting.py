@@ -9,6 +9,7 @@ from unittest.mock import patch
 import pytest
 from calibrated import EXPERIMENT_2, calibrated
 from commands import run_orthocal
+from conftest import marked_pictures
 from linuxcnc import few_nodes
 
 from orthocal import write_calibration
@@ -17,14 +18,18 @@ from orthocal.export.linuxcnc import approximation, export
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cheap_results(short_reports):
+def cheap_results(short_reports, judged_sessions):
     """Short reports, and one module of few nodes: complete ones have tests of their own."""
 
     @cache
     def approximate(**options):
         return approximation.approximate(calibrated(EXPERIMENT_2), **options)
 
-    with few_nodes(), patch.object(export, "approximate", lambda _, **o: approximate(**o)):
+    with (
+        few_nodes(),
+        marked_pictures(),
+        patch.object(export, "approximate", lambda _, **o: approximate(**o)),
+    ):
         yield
 
 
