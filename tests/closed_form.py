@@ -1,8 +1,6 @@
-"""Closed-form kinematics of the Orthoglide, vectorised over postures.
+"""Closed-form kinematics of the Orthoglide: equations (1) to (6) of Pashkevich and others (2006).
 
-Equations (1) to (6) of Pashkevich, Chablat and Wenger (2006) check the closed-loop model; the
-identification does not use them. R = ρ + Δρ are the actual positions of the slides. Docstrings
-mark the formulas that are corrected here.
+R = ρ + Δρ are the actual positions of the slides; points and joints have the shape (..., 3), [m].
 """
 
 from __future__ import annotations
@@ -21,19 +19,7 @@ from orthocal.units import MM
 def constraint_residual(
     points: ArrayLike, joints: ArrayLike, *, length: float, offsets: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Residual of equation (1): squared leg lengths minus L².
-
-        (p_i − R_i)² + Σ_{j≠i} p_j² − L²
-
-    Args:
-        points: Tool centre points, shape (..., 3), [m].
-        joints: Commanded joint coordinates ρ, shape (..., 3), [m].
-        length: Leg length L, [m].
-        offsets: Joint offsets Δρ, shape (3,), [m].
-
-    Returns:
-        Shape (..., 3), [m²].
-    """
+    """Residual of equation (1): (p_i − R_i)² + Σ_{j≠i} p_j² − L², shape (..., 3), [m²]."""
     p = np.asarray(points, dtype=np.float64)
     slides = np.asarray(joints, dtype=np.float64) + np.asarray(offsets, dtype=np.float64)
     return np.asarray((p - slides) ** 2 + _others(p) - length**2)
@@ -46,21 +32,9 @@ def inverse(
     offsets: ArrayLike = (0.0, 0.0, 0.0),
     configuration: Sequence[int] = (1, 1, 1),
 ) -> Array:
-    """Inverse kinematics, equation (2).
+    """Equation (2): ρ_i = p_i + s_i √(L² − Σ_{j≠i} p_j²) − Δρ_i.
 
-        ρ_i = p_i + s_i √(L² − Σ_{j≠i} p_j²) − Δρ_i
-
-    Args:
-        points: Tool centre points, shape (..., 3), [m].
-        length: Leg length L, [m].
-        offsets: Joint offsets Δρ, shape (3,), [m].
-        configuration: Signs s_i, each 1 or −1; the machine is built with (1, 1, 1).
-
-    Returns:
-        Joint coordinates ρ, shape (..., 3), [m].
-
-    Raises:
-        UnreachableError: If a point is out of reach of a leg; names the first one.
+    The machine is built with signs s_i = 1. A point out of reach is an UnreachableError.
     """
     p = np.asarray(points, dtype=np.float64)
     signs = np.asarray(configuration)
@@ -84,25 +58,11 @@ def direct(
     offsets: ArrayLike = (0.0, 0.0, 0.0),
     root: int = -1,
 ) -> Array:
-    """Direct kinematics, equation (3).
+    """Equation (3): p_i = R_i/2 + t/R_i with t = (−b + m √(b² − 4 a c)) / (2 a).
 
-        p_i = R_i/2 + t/R_i,  t = (−b + m √(b² − 4 a c)) / (2 a)
-        a = Σ_{i<j} R_i² R_j²,  b = Π R_i²,  c = (Σ R_i²/4 − L²) Π R_i²
-
-    a and c are corrected: the paper prints a product for a, and c without its factor. The machine
-    is built with m = −1, which the paper does not state.
-
-    Args:
-        joints: Commanded joint coordinates ρ, shape (..., 3), [m].
-        length: Leg length L, [m].
-        offsets: Joint offsets Δρ, shape (3,), [m].
-        root: m, 1 or −1.
-
-    Returns:
-        Tool centre points, shape (..., 3), [m].
-
-    Raises:
-        UnreachableError: If the legs do not meet, or a slide is at the origin.
+    a = Σ_{i<j} R_i² R_j², where the paper prints a product, b = Π R_i² and
+    c = (Σ R_i²/4 − L²) Π R_i², which the paper prints without its factor. The machine is built with
+    m = −1. Legs that do not meet, and a slide at the origin, are an UnreachableError.
     """
     if root not in (-1, 1):
         raise UnreachableError(f"root is {root}; expected 1 or -1")
@@ -130,17 +90,9 @@ def direct(
 def inverse_jacobian(
     points: ArrayLike, joints: ArrayLike, *, offsets: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Inverse Jacobian J⁻¹ = ∂ρ/∂p, equation (4), with R instead of ρ (corrected).
+    """Equation (4) with R instead of ρ (corrected), shape (..., 3, 3).
 
-        J⁻¹_ij = p_j / (p_i − R_i) for j ≠ i, 1 on the diagonal
-
-    Args:
-        points: Tool centre points, shape (..., 3), [m].
-        joints: Commanded joint coordinates ρ, shape (..., 3), [m].
-        offsets: Joint offsets Δρ, shape (3,), [m].
-
-    Returns:
-        Shape (..., 3, 3).
+    J⁻¹_ij = ∂ρ_i/∂p_j = p_j / (p_i − R_i) for j ≠ i, 1 on the diagonal.
     """
     p = np.asarray(points, dtype=np.float64)
     slides = np.asarray(joints, dtype=np.float64) + np.asarray(offsets, dtype=np.float64)
@@ -153,19 +105,7 @@ def inverse_jacobian(
 def jacobian(
     points: ArrayLike, joints: ArrayLike, *, offsets: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Jacobian J = ∂p/∂ρ = ∂p/∂Δρ, the inverse of equation (4).
-
-    Args:
-        points: Tool centre points, shape (..., 3), [m].
-        joints: Commanded joint coordinates ρ, shape (..., 3), [m].
-        offsets: Joint offsets Δρ, shape (3,), [m].
-
-    Returns:
-        Shape (..., 3, 3).
-
-    Raises:
-        UnreachableError: If a posture is singular.
-    """
+    """J = ∂p/∂ρ = ∂p/∂Δρ, the inverse of (4); a singular posture is an UnreachableError."""
     try:
         return np.asarray(np.linalg.inv(inverse_jacobian(points, joints, offsets=offsets)))
     except np.linalg.LinAlgError:
@@ -173,18 +113,9 @@ def jacobian(
 
 
 def displacement_jacobian(axis: int, displacement: float, *, length: float) -> Array:
-    """Jacobian at a displacement along one axis, equation (5), for sensitivities, equation (6).
+    """Equation (5), ∂p/∂Δρ at a displacement along an axis; the paper calls it J⁻¹ (corrected).
 
-    Equation (5) is J, not J⁻¹ as the paper states (corrected). The column of the moving axis is 1
-    on the diagonal and T_α = tan α elsewhere.
-
-    Args:
-        axis: 0, 1, 2 for a motion along x, y, z.
-        displacement: Signed displacement of the tool from the mechanical zero, [m].
-        length: Leg length L, [m].
-
-    Returns:
-        Shape (3, 3): ∂p/∂Δρ.
+    The column of the moving axis is 1 on the diagonal and T_α = tan α elsewhere.
     """
     result = np.eye(3)
     others = [i for i in range(3) if i != axis]

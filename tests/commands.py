@@ -1,8 +1,4 @@
-"""Commands as a shell has them, run here: their imports and functions are those of one process.
-
-A process of its own begins the command line in `test_cli.py`, `test_streams.py`, `test_package.py`.
-Without `--workers` a command here begins no processes: tests occupy all cores.
-"""
+"""Commands as a shell has them, run in this process; without `--workers` they begin no others."""
 
 from __future__ import annotations
 

@@ -97,11 +97,7 @@ def load_afresh(robot):
 
 @pytest.fixture(scope="module")
 def short_reports():
-    """Reports with marks in place of plots and scenes, and without gains of usual sensors.
-
-    All of these take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
-    Sheets have marks in place of pictures of the machine.
-    """
+    """Reports and sheets with marks for plots, scenes and pictures, without gains of sensors."""
     from orthocal.output.report import page
     from orthocal.output.text.accuracy import FurtherHour
 

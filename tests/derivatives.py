@@ -40,13 +40,7 @@ def assert_program_derivatives(
 ) -> None:
     """Compare gradient, Jacobian and Hessian of a nonlinear program with central differences.
 
-    Args:
-        f: Functions of the program, as Ipopt calls them.
-        x: Its variables.
-        p: Its parameters.
-        weight: Factor of the objective in the Lagrangian.
-        directions: Number of drawn directions along which the derivatives are compared.
-        seed: Of the directions and of the multipliers.
+    The directions and multipliers are drawn; `weight` is the objective's factor in the Lagrangian.
     """
     rng, zero = np.random.default_rng(seed), np.zeros(directions)
     along = rng.normal(size=(x.size, directions))

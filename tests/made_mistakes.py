@@ -332,12 +332,9 @@ def sound_session(plan, seed: int, *, entered: bool):
 
 
 def sound_machine(plan, seed: int, *, entered: bool):
-    """Errors of a machine with all errors at their tolerances, and a session of it.
+    """Errors of a machine at their tolerances, and a session of it.
 
-    Args:
-        plan: What is read where.
-        seed: Of the machine and its readings.
-        entered: Whether its offsets were entered, up to 20 µm, with what its errors leave.
+    With its offsets `entered`, up to 20 µm, or at 0.4 of their tolerance.
     """
     robot = plan.robot
     for attempt in range(20):

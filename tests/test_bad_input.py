@@ -1,7 +1,6 @@
 """Broken inputs: each has its message, exit code 2, no traceback, and leaves no file behind.
 
-The cases are the rows of `bad_input.txt`, which says how to read it. Every case spoils one good
-input in one way and runs one command.
+The cases are the rows of `bad_input.txt`, each of which spoils one good input in one way.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""Complete use of the command line on a machine with legs of 250 mm, up to a better part.
+"""Complete use of the command line on simulated machines at their tolerances, up to a better part.
 
-new → check → calibrate → enter → calibrate → export → LinuxCNC. The machine is simulated with all
-errors at their tolerances and realistic gauge misalignment. `test_ball_bar_use.py` has `record`.
-
-With effects beside geometry: new → simulate → calibrate → export → again → simulate → validate →
-calibrate both → correct. The independent simulator makes the part.
+new → check → calibrate → enter → calibrate → export → LinuxCNC; and with effects new → simulate →
+calibrate → export → again → simulate → validate → calibrate both → correct.
 """
 
 from __future__ import annotations
@@ -197,8 +194,7 @@ def warming_machine(tmp_path_factory, short_reports):
 def drill(folder, program):
     """Error of the actual holes after alignment of the part, RMS, [m].
 
-    The controller has nominal kinematics, the offsets and the backlash of the second session. The
-    machine is that of the independent simulator; its slides have backlash.
+    The controller has nominal kinematics and the offsets and the backlash of the second session.
     """
     both, bare = load_calibration(folder / "both"), folder / "bare"
     robot = both.robot

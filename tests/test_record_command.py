@@ -169,7 +169,8 @@ def test_instructions_of_a_setup_and_a_posture(folder, run):
         assert words in text
 
 
-def test_a_setup_names_the_motions_with_the_plunger_up_as_the_sheet_does(folder, run):
+def test_a_setup_names_the_motions_with_the_plunger_up_as_the_sheet_does(folder, run, monkeypatch):
+    monkeypatch.setattr(recording.Dialogue, "_is_judged", False)
     plan = PLAN.replace("x_max: {tcp_mm: [60, 0, 0]}", "aside: {tcp_mm: [0, 12, 0]}")
     (folder / "session.yaml").write_text(plan)
     (motion, other) = plan_motion(load_plan(folder))
@@ -437,14 +438,14 @@ def test_a_warning_names_all_of_its_lines(root, run, tmp_path):
 
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):
     folder = tmp_path / "typed"
-    values = blank(root / "examples/raw-cycles", folder, cycles=1)
-    setups = [r.setup for r in load_plan(folder).readings]
-    for row in range(len(values)):
-        if setups[row] == "xz":
-            reverse_sign(values, row)
-    _, out, _ = run(folder, *values)
+    setups = [r.setup for r in load_plan(root / "examples/raw-cycles").readings if r.cycle == 1]
+    start, end = setups.index("xz"), setups.index("yz")
+    values = blank(root / "examples/raw-cycles", folder, cycles=1, recorded=start)
+    for row in range(start, end):
+        reverse_sign(values, row)
+    _, out, _ = run(folder, *values[start:])
     first = next(iter(WARNING.finditer(out)))
-    assert out.count("Recorded: line", 0, first.start()) <= setups.index("yz")
+    assert out.count("Recorded: line", 0, first.start()) <= end - start
     (finding,) = require_agreement(out, folder)
     assert (finding.kind, [p.setup for p in finding.places]) == ("reversed sign", ["xz"])
 
