@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import EXPERIMENT_2, calibrated, identified
 
 from orthocal import (
     CalibrationProblem,
@@ -55,8 +56,8 @@ from orthocal.kinematics.loop_closure import LoopClosure
 
 
 @pytest.fixture(scope="module")
-def calibration(experiment_2):
-    return calibrate(experiment_2)
+def calibration():
+    return calibrated(EXPERIMENT_2)
 
 
 @pytest.mark.parametrize("load", [load_session, load_plan, load_calibration, load_robot])
@@ -126,7 +127,7 @@ def test_millimetres_cannot_pass_for_metres(arguments, experiment_2):
 
 def test_a_choice_in_any_unit_is_the_same_choice(experiment_2):
     found = [
-        calibrate(experiment_2, Choice(known={f"y_slide.offset_{u}": v})).total_covariance
+        identified(experiment_2, Choice(known={f"y_slide.offset_{u}": v})).total_covariance
         for u, v in (("mm", (0.5, 0.1)), ("um", (500.0, 100.0)), ("m", (0.5e-3, 0.1e-3)))
     ]
     for other in found[1:]:
