@@ -228,134 +228,80 @@ def test_tool_position_of_postures_stated_by_joints(tmp_path):
     assert back == pytest.approx([370.0, 305.0, 305.0])
 
 
-ENTRIES = {
-    "nothing": (["", "0.1"], ["0.10"], "Not recorded: type the reading of the dial, or `skip`"),
-    "back": (["0.1", "back", "0,2"], ["0.20"], "Recorded: 0.10 mm; Enter keeps it."),
-    "back and keep": (["0.1", "b", ""], ["0.10"], "Line 3: yx x_max (5 of 6 missing)"),
-    "back to a row": (
-        ["0.1", "0.2", "back 2", "0.3"],
-        ["0.30", "0.20"],
-        "Line 2: yx zero (4 of 6 missing)",
-    ),
-    "back to an earlier setup": (
-        [*["0.1"] * 4, "back 2", "0.2"],
-        ["0.20", *["0.10"] * 3],
-        "gauge or its stand has moved since, correct typing errors only, or type `restart 2`",
-    ),
-    "back after a repetition": (
-        ["0.1", "repeat", "0.11", "back", "0.12"],
-        ["0.10", *[""] * 5, "0.12"],
-        "Recorded: 0.11 mm; Enter keeps it.",
-    ),
-    "back beyond": (["back"], [], "Not recorded: this is the first line."),
-    "back to none": (["back 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
-    "back to a word": (["back to"], [], "Not recorded: 'to' is not a line; expected 2 to 7."),
-    "repeat": (
-        ["0.1", "repeat", "0.11"],
-        ["0.10", "", "", "", "", "", "0.11"],
-        "Line 8: yx zero, cycle 2 (6 of 7 missing)",
-    ),
-    "repeat of a row": (
-        ["0.1", "0.2", "repeat 2", "0.11", "0.3"],
-        ["0.10", "0.20", "0.30", "", "", "", "0.11"],
-        "Added: line 8, which repeats line 2. Line 8: yx zero, cycle 2",
-    ),
-    "repeat of an earlier setup": (
-        ["0.1", "0.2", "0.3", "0.4", "repeat 2"],
-        ["0.10", "0.20", "0.30", "0.40"],
-        "Another setup was read after yx. If the gauge or its stand has moved since",
-    ),
-    "repeat of nothing": (["repeat"], [], "Not recorded: nothing was read yet."),
-    "repeat of an empty row": (["repeat 3"], [], "Not recorded: line 3 was not read yet."),
-    "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: line 2"),
-    "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Line 4: yx x_min (4 of 5 missing)"),
-    "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Line 4: yx x_min (4 of 5 missing)"),
-    "back to a dropped row": (
-        ["0.1", "drop 3", "back 3", "0.2"],
-        ["0.10", "", "", "", "", "0.20"],
-        "`back 3` adds it again, as the last line. Line 4: yx x_min (4 of 5 missing)",
-    ),
-    "back to a dropped row twice": (
-        ["drop 3", "back 3", "back 3"],
-        [""] * 6,
-        "Not recorded: line 3 is line 8 now.",
-    ),
-    "repeat of a dropped row": (
-        ["0.1", "drop 2", "repeat 2"],
-        [""] * 5,
-        "Not recorded: line 2 was deleted; `back 2` adds it again, as the last line.",
-    ),
-    "back to a row that was dropped twice": (
-        ["drop 3", "back 3", "drop", "back 3", "0.1"],
-        ["", "", "", "", "", "0.10"],
-        "Added: line 8, yx x_max.",
-    ),
-    "repeat of a line with the number of a dropped row": (
-        ["drop 7", "0.1", "repeat 2", "repeat 7"],
-        ["0.10"],
-        "Not recorded: line 7 was not read yet.",
-    ),
-    "restart": (
-        ["0.1", "0.2", "restart", "restart", "0.3"],
-        ["0.30"],
-        "`restart` deletes 2 readings of yx. Type it again to delete; any other line keeps them.",
-    ),
-    "restart that is not confirmed": (
-        ["0.1", "0.2", "restart", "list", "restart", "0.3", "restart 2"],
-        ["0.10", "0.20", "0.30"],
-        "`restart` deletes 3 readings of yx.",
-    ),
-    "restart of two setups": (
-        [*["0.1"] * 4, "restart", "restart 2", "restart"],
-        ["0.10"] * 4,
-        "`restart` deletes 3 readings of yx.",
-    ),
-    "restart without readings": (["restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
-    "restart of an earlier setup": (
-        ["0.1", "0.2", "0.3", "0.4", "restart 3", "restart 3", "0.5"],
-        ["0.50", "", "", "0.40"],
-        "Deleted: all readings of yx Setup yx, 1 of 2",
-    ),
-    "restart of nothing": (["restart 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
-    "list": (["0.1", "list"], ["0.10"], "3 yx x_max: not read"),
-    "show": (["show"], [], "Setup yx, 1 of 2"),
-    "help": (["help"], [], "repeat: read the last line once more, as another cycle"),
-    "?": (["?"], [], "Ctrl-D and Ctrl-C end, too."),
-    "quit": (["quit", "0.1"], [], "6 of 6 readings are missing"),
-    "exit": (["exit", "0.1"], [], "6 of 6 readings are missing"),
-    "q": (["0.1", "Q", "0.2"], ["0.10"], "5 of 6 readings are missing: yx lines 3, 4 and zx all"),
-    "two of them": (
-        ["s"],
-        [],
-        "Not recorded: 's' is not a command (skip or side or show?); `help` lists them.",
-    ),
-    "none": (["burn"], [], "Not recorded: 'burn' is not a command; `help` lists them."),
-    "too much": (["skip 3"], [], "Not recorded: `skip` has no argument '3'."),
-    "comma": (["1,234"], ["1.234"], "Line 3"),
-    "range": (["5.5"], [], "yx zero: reading_mm is 5.5; the gauge's range allows a reading from"),
-    "resolution": (
-        ["0.123"],
-        ["0.123"],
-        "! Finer than the gauge (line 2): The gauge shows steps of 0.01 mm",
-    ),
-    "no text": (["\ufffd\x1b[2J"], [], r"is neither a number nor a command"),
-}
+ENTRIES = """
+; 0.1 | 0.10 | Not recorded: type the reading of the dial, or `skip`
+0.1; back; 0,2 | 0.20 | Recorded: 0.10 mm; Enter keeps it.
+0.1; b;  | 0.10 | Line 3: yx x_max (5 of 6 missing)
+0.1; 0.2; back 2; 0.3 | 0.30 0.20 | Line 2: yx zero (4 of 6 missing)
+0.1; 0.1; 0.1; 0.1; back 2; 0.2 | 0.20 0.10 0.10 0.10 |
+    has moved since, correct typing errors only, or type `restart 2`
+0.1; repeat; 0.11; back; 0.12 | 0.10 - - - - - 0.12 | Recorded: 0.11 mm; Enter keeps it.
+back | - | Not recorded: this is the first line.
+back 1 | - | Not recorded: '1' is not a line; expected 2 to 7.
+back to | - | Not recorded: 'to' is not a line; expected 2 to 7.
+0.1; repeat; 0.11 | 0.10 - - - - - 0.11 | Line 8: yx zero, cycle 2 (6 of 7 missing)
+0.1; 0.2; repeat 2; 0.11; 0.3 | 0.10 0.20 0.30 - - - 0.11 |
+    Added: line 8, which repeats line 2. Line 8: yx zero, cycle 2
+0.1; 0.2; 0.3; 0.4; repeat 2 | 0.10 0.20 0.30 0.40 |
+    Another setup was read after yx. If the gauge or its stand has moved since
+repeat | - | Not recorded: nothing was read yet.
+repeat 3 | - | Not recorded: line 3 was not read yet.
+skip; 0.2 | - 0.20 | Skipped: line 2
+0.1; drop; 0.3 | 0.10 0.30 | Line 4: yx x_min (4 of 5 missing)
+0.1; drop 2; 0.3 | 0.30 | Line 4: yx x_min (4 of 5 missing)
+0.1; drop 3; back 3; 0.2 | 0.10 - - - - 0.20 |
+    `back 3` adds it again, as the last line. Line 4: yx x_min (4 of 5 missing)
+drop 3; back 3; back 3 | - - - - - - | Not recorded: line 3 is line 8 now.
+0.1; drop 2; repeat 2 | - - - - - |
+    Not recorded: line 2 was deleted; `back 2` adds it again, as the last line.
+drop 3; back 3; drop; back 3; 0.1 | - - - - - 0.10 | Added: line 8, yx x_max.
+drop 7; 0.1; repeat 2; repeat 7 | 0.10 | Not recorded: line 7 was not read yet.
+0.1; 0.2; restart; restart; 0.3 | 0.30 |
+    2 readings of yx. Type it again to delete; any other line keeps them.
+0.1; 0.2; restart; list; restart; 0.3; restart 2 | 0.10 0.20 0.30 |
+    `restart` deletes 3 readings of yx.
+0.1; 0.1; 0.1; 0.1; restart; restart 2; restart | 0.10 0.10 0.10 0.10 |
+    `restart` deletes 3 readings of yx.
+restart; 0.3 | 0.30 | Deleted: all readings of yx
+0.1; 0.2; 0.3; 0.4; restart 3; restart 3; 0.5 | 0.50 - - 0.40 |
+    Deleted: all readings of yx Setup yx, 1 of 2
+restart 1 | - | Not recorded: '1' is not a line; expected 2 to 7.
+0.1; list | 0.10 | 3 yx x_max: not read
+show | - | Setup yx, 1 of 2
+help | - | repeat: read the last line once more, as another cycle
+? | - | Ctrl-D and Ctrl-C end, too.
+quit; 0.1 | - | 6 of 6 readings are missing
+exit; 0.1 | - | 6 of 6 readings are missing
+0.1; Q; 0.2 | 0.10 | 5 of 6 readings are missing: yx lines 3, 4 and zx all
+s | - | Not recorded: 's' is not a command (skip or side or show?); `help` lists them.
+burn | - | Not recorded: 'burn' is not a command; `help` lists them.
+skip 3 | - | Not recorded: `skip` has no argument '3'.
+1,234 | 1.234 | Line 3
+5.5 | - | yx zero: reading_mm is 5.5; the gauge's range allows a reading from
+0.123 | 0.123 | ! Finer than the gauge (line 2): The gauge shows steps of 0.01 mm
+\ufffd\x1b[2J | - | is neither a number nor a command
+"""
+"""What is typed, the recorded cells, and words of the answer."""
 
 
-JUDGED = ("back to a row that was dropped twice", "restart of two setups", "resolution")
+JUDGED = (
+    "drop 3; back 3; drop; back 3; 0.1",
+    "0.1; 0.1; 0.1; 0.1; restart; restart 2; restart",
+    "0.123",
+)
 """Entries for which readings are predicted and judged, too."""
 
 
-@pytest.mark.parametrize("name", ENTRIES)
-def test_entries_on_a_narrow_terminal(folder, run, request, name):
-    if name not in JUDGED:
+@pytest.mark.parametrize("entry", ENTRIES.strip().replace("\n    ", " ").splitlines())
+def test_entries_on_a_narrow_terminal(folder, run, request, entry):
+    typed, read, words = entry.split(" | ")
+    if typed not in JUDGED:
         request.getfixturevalue("unjudged")
-    typed, read, words = ENTRIES[name]
-    code, out, err = run(folder, *typed, columns=40)
+    code, out, err = run(folder, *typed.split("; "), columns=40)
     assert (code, err) == (0, "")
     assert words in " ".join(out.split())
-    expected = (read + [""] * 7)[: len(cells(folder))]
-    assert cells(folder) == expected
+    expected = [cell.strip("-") for cell in read.split()] + [""] * 7
+    assert cells(folder) == expected[: len(cells(folder))]
     assert "\x1b" not in out
     *narrow, command = out.splitlines()
     assert max(map(len, narrow)) <= 40
