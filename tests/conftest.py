@@ -146,29 +146,20 @@ def assessed_once():
         yield
 
 
-@pytest.fixture
-def without_sensor_gains():
-    """Plans and details without gains of usual sensors, which have tests of their own."""
-    with no_sensor_gains():
-        yield
-
-
-@pytest.fixture(scope="module")
-def module_without_sensor_gains():
-    """`without_sensor_gains` for all tests of a module."""
-    with no_sensor_gains():
-        yield
-
-
 @contextmanager
 def no_sensor_gains():
-    """No gains of usual sensors: they are four searches of a plan each time."""
+    """Plans and details without gains of usual sensors, which have tests of their own."""
     from orthocal.planning import first_plan, plan, sensor_gains
 
     with ExitStack() as patches:
         for module in (sensor_gains, first_plan, plan):
             patches.enter_context(patch.object(module, "find_sensor_gains", lambda *_: ()))
         yield
+
+
+def module_fixture(manager):
+    """A context manager as a fixture for all tests of a module."""
+    return pytest.fixture(scope="module")(manager.__wrapped__)
 
 
 @contextmanager
@@ -194,13 +185,6 @@ def judged_once():
         yield
 
 
-@pytest.fixture(scope="module")
-def judged_sessions():
-    """`judged_once` for all tests of a module."""
-    with judged_once():
-        yield
-
-
 @contextmanager
 def plans_of_few_candidates():
     """Plans of commands with few candidates and one start; tests/planning verify plans."""
@@ -223,19 +207,18 @@ def plans_of_few_candidates():
         yield
 
 
+judged_sessions = module_fixture(judged_once)
+quick_plans = module_fixture(plans_of_few_candidates)
+without_sensor_gains = pytest.fixture(no_sensor_gains.__wrapped__)
+module_without_sensor_gains = module_fixture(no_sensor_gains)
+
+
 @pytest.fixture(scope="module")
 def module_of_few_machines():
     """Plans of all tests of a module with expected errors of few machines."""
     from uncompared import few_machines
 
     with few_machines():
-        yield
-
-
-@pytest.fixture(scope="module")
-def quick_plans():
-    """Plans of `orthocal new` with few candidates and one start."""
-    with plans_of_few_candidates():
         yield
 
 
