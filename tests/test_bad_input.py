@@ -178,7 +178,7 @@ def test_cases_have_names_of_their_own():
 
 @pytest.mark.parametrize("base", ["differences", "cycles", "machine"])
 def test_what_the_cases_spoil_is_good(base, lay_out, tmp_path):
-    done = run_orthocal(lay_out(base), *arguments(CALIBRATE, tmp_path))
+    done = run_orthocal(lay_out(base), *arguments(f"{CALIBRATE} --solver linearised", tmp_path))
     assert done.returncode == 0
     out = f"{tmp_path}/out"
     assert done.stderr == f"Wrote {out}/calibration.json and {out}/report.html\n"
