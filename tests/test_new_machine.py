@@ -34,15 +34,9 @@ from orthocal.session.session import Purpose
 
 pytestmark = pytest.mark.usefixtures("short_reports")
 
-SIZES = {
-    "--leg-mm": "250",
-    "--travel-mm": "100:320",
-    "--attachment-mm": "30",
-    "--rods-apart-mm": "60",
-    "--rod-radius-mm": "4",
-    "--counts": "up,down,up",
-    "--at-zero-mm": "0",
-}
+DIMENSIONS = """--leg-mm 250 --travel-mm 100:320 --attachment-mm 30 --rods-apart-mm 60
+--rod-radius-mm 4 --counts up,down,up --at-zero-mm 0""".split()
+SIZES = dict(zip(DIMENSIONS[::2], DIMENSIONS[1::2], strict=True))
 QUICK = ["--solver", "variable-projection"]
 PROGRAMS = [f"{i:02d}-{name}.ngc" for i, name in enumerate("yx zx xy zy xz yz".split(), 1)]
 
