@@ -43,12 +43,7 @@ def turned(keys, amount):
 
 
 def shim(machine, amounts):
-    """Pinocchio model of a machine (with errors) whose feet are moved, one after the other.
-
-    Args:
-        machine: The robot.
-        amounts: Adjustment to its amount, [m]; feet of slides that stand on the base.
-    """
+    """Pinocchio model of a machine whose feet are moved, one after the other, [m]."""
     model = machine.model.copy()
     for name, amount in amounts.items():
         keys = machine.declared.adjustments[name]

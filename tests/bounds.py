@@ -38,16 +38,9 @@ def bound_um(plan, space, *, offset_std=2e-3):
 
 
 def rms_band(field, weights, covariance, count):
-    """99 % band of the ratio of an RMS tool error over machines to its expectation.
+    """99 % band of the ratio of an RMS tool error over `count` machines to its expectation.
 
-    The mean square is a quadratic form of normal errors. Its distribution is that of a χ² with the
-    same mean and variance (Satterthwaite).
-
-    Args:
-        field: Jacobian of the tool errors at the points, shape (K, 3, n), [m/SI].
-        weights: Weights of the points, shape (K,).
-        covariance: Covariance of the errors, shape (n, n), [SI].
-        count: Number of machines.
+    Its square is taken as χ² with the same mean and variance (Satterthwaite); field (K, 3, n).
     """
     rows = (np.sqrt(weights)[:, None, None] * field).reshape(-1, field.shape[-1])
     eigenvalues = np.linalg.eigvalsh(rows @ covariance @ rows.T)

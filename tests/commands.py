@@ -1,8 +1,4 @@
-"""Commands as a shell has them, run here: their imports and functions are those of one process.
-
-A process of its own begins the command line in `test_cli.py`, `test_streams.py`, `test_package.py`.
-Without `--workers` a command here begins no processes: tests occupy all cores.
-"""
+"""Commands as a shell has them, run in this process; without `--workers` they begin no others."""
 
 from __future__ import annotations
 
@@ -39,7 +35,8 @@ def run_here(folder, act, *, argv=("orthocal",), typed="", terminal=False):
     """Do something as a program does: in a folder, with streams and arguments of its own."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
     kind = Terminal if terminal else io.TextIOWrapper
-    stdin = kind(io.BytesIO(typed.encode()), encoding="utf-8")
+    lines = typed.encode() if isinstance(typed, str) else typed
+    stdin = kind(io.BytesIO(lines), encoding="utf-8")
     code = 0
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
         with (

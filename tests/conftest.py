@@ -97,11 +97,7 @@ def load_afresh(robot):
 
 @pytest.fixture(scope="module")
 def short_reports():
-    """Reports with marks in place of plots and scenes, and without gains of usual sensors.
-
-    All of these take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
-    Sheets have marks in place of pictures of the machine.
-    """
+    """Reports and sheets with marks for plots, scenes and pictures, without gains of sensors."""
     from orthocal.output.report import page
     from orthocal.output.text.accuracy import FurtherHour
 
@@ -150,28 +146,42 @@ def assessed_once():
         yield
 
 
-@pytest.fixture
-def without_sensor_gains():
-    """Plans and details without gains of usual sensors, which have tests of their own."""
-    with no_sensor_gains():
-        yield
-
-
-@pytest.fixture(scope="module")
-def module_without_sensor_gains():
-    """`without_sensor_gains` for all tests of a module."""
-    with no_sensor_gains():
-        yield
-
-
 @contextmanager
 def no_sensor_gains():
-    """No gains of usual sensors: they are four searches of a plan each time."""
+    """Plans and details without gains of usual sensors, which have tests of their own."""
     from orthocal.planning import first_plan, plan, sensor_gains
 
     with ExitStack() as patches:
         for module in (sensor_gains, first_plan, plan):
             patches.enter_context(patch.object(module, "find_sensor_gains", lambda *_: ()))
+        yield
+
+
+def module_fixture(manager):
+    """A context manager as a fixture for all tests of a module."""
+    return pytest.fixture(scope="module")(manager.__wrapped__)
+
+
+@contextmanager
+def judged_once():
+    """Equal readings of files with equal tolerances are judged once."""
+    from orthocal.assessment import judgement
+
+    judge, judged = judgement.judge_session, {}
+
+    def judge_once(session):
+        parameters = session.robot.parameters
+        key = session.sha256, session.robot.sha256, str(parameters.stated), parameters.names
+        if not session.sha256:
+            return judge(session)
+        if key not in judged:
+            judged[key] = judge(session)
+        return judged[key]
+
+    with (
+        patch.object(judgement, "judge_session", judge_once),
+        patch.object(orthocal, "judge_session", judge_once),
+    ):
         yield
 
 
@@ -197,19 +207,18 @@ def plans_of_few_candidates():
         yield
 
 
+judged_sessions = module_fixture(judged_once)
+quick_plans = module_fixture(plans_of_few_candidates)
+without_sensor_gains = pytest.fixture(no_sensor_gains.__wrapped__)
+module_without_sensor_gains = module_fixture(no_sensor_gains)
+
+
 @pytest.fixture(scope="module")
 def module_of_few_machines():
     """Plans of all tests of a module with expected errors of few machines."""
     from uncompared import few_machines
 
     with few_machines():
-        yield
-
-
-@pytest.fixture(scope="module")
-def quick_plans():
-    """Plans of `orthocal new` with few candidates and one start."""
-    with plans_of_few_candidates():
         yield
 
 

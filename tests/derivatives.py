@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from tolerances import DERIVATIVE
 
 
-def central_differences(
-    function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, *, step: float = 1e-6
-) -> np.ndarray:
+def central_differences(function, at, *, step=1e-6):
     """Derivative of a function of a vector, shape (*output, n)."""
     columns = []
     for i in range(at.size):
@@ -21,13 +17,13 @@ def central_differences(
 
 
 def assert_derivative(
-    exact: np.ndarray,
-    function: Callable[[np.ndarray], np.ndarray],
-    at: np.ndarray,
+    exact,
+    function,
+    at,
     *,
-    step: float = 1e-6,
-    tolerance: float = DERIVATIVE,
-) -> None:
+    step=1e-6,
+    tolerance=DERIVATIVE,
+):
     """Compare an exact derivative with central differences, relative to the largest entry."""
     numeric = central_differences(function, at, step=step)
     assert np.all(np.isfinite(exact))
@@ -35,18 +31,10 @@ def assert_derivative(
     assert np.abs(exact - numeric).max(initial=0.0) / scale < tolerance
 
 
-def assert_program_derivatives(
-    f: dict, x: np.ndarray, p: np.ndarray, *, weight: float, directions: int, seed: int
-) -> None:
+def assert_program_derivatives(f, x, p, *, weight, directions, seed):
     """Compare gradient, Jacobian and Hessian of a nonlinear program with central differences.
 
-    Args:
-        f: Functions of the program, as Ipopt calls them.
-        x: Its variables.
-        p: Its parameters.
-        weight: Factor of the objective in the Lagrangian.
-        directions: Number of drawn directions along which the derivatives are compared.
-        seed: Of the directions and of the multipliers.
+    The directions and multipliers are drawn; `weight` is the objective's factor in the Lagrangian.
     """
     rng, zero = np.random.default_rng(seed), np.zeros(directions)
     along = rng.normal(size=(x.size, directions))

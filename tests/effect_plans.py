@@ -34,13 +34,7 @@ ALONG = (-100, -47, 23, 60)
 
 
 def write_robot(folder, effects, *, joints=None):
-    """The packaged robot with further effects in its YAML.
-
-    Args:
-        folder: Directory to write.
-        effects: Keys of effects, as YAML.
-        joints: Drive to the keys of its joint, as YAML.
-    """
+    """The packaged robot with further effects and keys of joints, as YAML."""
     source = packaged_robots()["orthoglide"]
     folder.mkdir(parents=True)
     shutil.copy(source / "orthoglide.urdf", folder / "machine.urdf")
@@ -91,13 +85,7 @@ def effect_folder(keys=EFFECTS):
 
 @cache
 def effect_plan(*chosen, keys=EFFECTS, setups=None):
-    """Plan of a machine with chosen effects.
-
-    Args:
-        chosen: Names of the effects.
-        keys: Keys of the effects in the robot's YAML.
-        setups: Names of the setups; all six by default.
-    """
+    """Plan of a machine with chosen effects and their keys; by default with all six setups."""
     plan = load_plan(effect_folder(keys)).with_effects(list(chosen))
     if setups is None:
         return plan

@@ -15,11 +15,7 @@ from packaging.utils import canonicalize_name
 
 
 def declared(requirements):
-    """Distributions that requirements ask for, and what those ask for in turn.
-
-    All of them are installed here; one that is not, or in another version than is asked for, is an
-    error, as it is to pip.
-    """
+    """Distributions that requirements ask for, and theirs in turn, as they are installed here."""
     found, pending = {}, [(Requirement(text), "") for text in requirements]
     seen = set()
     while pending:

@@ -3,7 +3,7 @@
 Case i of a seed is always the same. Workers run cases in processes of their own, so that a crash or
 a blow-up of memory is seen, too. By hand:
 
-    python tests/fuzzing.py --count 50000 --keep /tmp/finds
+    python tests/fuzzing.py --count 50000
 """
 
 from __future__ import annotations
@@ -803,7 +803,6 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--thorough", type=float, default=1.0)
-    parser.add_argument("--keep", type=Path, help="Folder for what was found.")
     given = parser.parse_args()
     thorough, seed, count = given.thorough, given.seed, given.count
     if given.worker:
@@ -813,12 +812,6 @@ def main() -> None:
         folder = Path(name)
         lay_out(folder)
         found = run(folder, seed=seed, count=count, jobs=given.jobs, thorough=thorough, report=tell)
-        if given.keep:
-            good = {kind: (folder / file).read_bytes() for kind, file in KINDS.items()}
-            given.keep.mkdir(parents=True, exist_ok=True)
-            for index, kind, _ in found.bad:
-                data = make_case(seed, index, good)[1]
-                (given.keep / f"{index}-{Path(KINDS[kind]).name}").write_bytes(data)
     for key, number in sorted(found.outcomes.items()):
         tell(f"{' '.join(key)} {number}")
     tell(f"{sum(found.outcomes.values())} cases, {len(found.bad)} bad")

@@ -35,11 +35,7 @@ def with_gauges(session, gauges, fine_setups):
 def with_scatter(session, theta, problem, rng):
     """The session with readings of a machine, each with the stated noise of its gauge.
 
-    Args:
-        session: Setups and postures.
-        theta: Free parameters of the machine, shape (n_free,), [SI].
-        problem: Problem of the session with these parameters.
-        rng: Source of the scatter.
+    `theta` are the free parameters of the problem, [SI].
     """
     sigmas = [session.gauges[s.gauge].sigma for s in session.setups.values()]
     scatter = rng.normal(size=problem.observations.size)

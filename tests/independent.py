@@ -1,12 +1,7 @@
 """A simulator of Orthoglides that shares no formula with orthocal: NumPy and SciPy on rigid bodies.
 
-It reads the robot's URDF and YAML itself. Errors of geometry are rigid-body displacements of
-placements, exponentials by `scipy.linalg.expm`. Loops are closed by Newton's method with Jacobians
-of finite differences. A gauge's reading is a point in which lines meet, or a root of a quadratic
-polynomial. Changes of the rods under load come from outside (`loaded_orthoglide`).
-
-Arrays of a batch begin with the machines, M, and the states, K. A state is a commanded posture with
-its approach and temperature.
+Errors displace placements (`expm`), Newton's method with finite differences closes the loops, and
+readings are where lines meet. Arrays begin with the machines, M, and the states, K.
 """
 
 from __future__ import annotations
@@ -88,14 +83,9 @@ def twist_matrix(twist):
 
 
 class IndependentMachine:
-    """One or many Orthoglides with errors and effects.
+    """One or many Orthoglides with errors (numbers, or values of M machines) and effects, [SI].
 
-    Args:
-        folder: Directory of the robot's URDF and YAML.
-        errors: Parameter name to its value, or to values of M machines, [SI].
-        lead: Lead of the screws, [m].
-        expansion: Stated thermal expansion, None for machines that do not expand.
-        active: Offsets active in the controller while the gauges were mounted, [m].
+    `active` are the offsets active in the controller while the gauges were mounted.
     """
 
     def __init__(self, folder, errors, *, lead=5e-3, expansion=None, active=0.0):
@@ -182,10 +172,7 @@ class IndependentMachine:
     def frames(self, actual, passive, growth):
         """Rotations (M, K, 3, 3) and positions (M, K, 3) of all links.
 
-        Args:
-            actual: Actual drive coordinates, shape (M, K, 3), [m].
-            passive: Passive coordinates, shape (M, K, 18), [rad].
-            growth: Growth of each rod, shape (M, K, 6), [m].
+        Actual drives (M, K, 3), passive coordinates (M, K, 18), growth of rods (M, K, 6), [m, rad].
         """
         poses = {"base": (np.eye(3)[None, None], np.zeros((1, 1, 3)))}
         for j in self.joints:
@@ -261,17 +248,9 @@ class IndependentMachine:
     # ---- readings
 
     def read(self, states, gauges, gauge, state, nuisance=None, time=None, drift=None):
-        """Readings with gauge zeros at 0, shape (M, n), [m].
+        """Readings with gauge zeros at 0, shape (M, n), [m], of a gauge, a state and a time, [s].
 
-        Args:
-            states: The states.
-            gauges: The gauges.
-            gauge: Gauge of each reading, shape (n,).
-            state: State of each reading, shape (n,).
-            nuisance: Errors of the mounting (roll, pitch, section, scale) of each gauge: name to
-                shape (M, n_gauges), [SI].
-            time: Of each reading since the first of its setup, shape (n,), [s].
-            drift: Of each gauge, shape (M, n_gauges), [m/s].
+        `nuisance` maps roll, pitch, section and scale to (M, n_gauges); so has `drift`, [m/s].
         """
         actual, growth = self.actual_drives(states), self.rod_growth(states)
         poses = self.frames(actual, self.close(actual, growth), growth)

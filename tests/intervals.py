@@ -1,9 +1,4 @@
-"""Coverage of 95 % intervals, counted on independent ones.
-
-The errors of one calibration are correlated: twelve intervals that are wrong together are one
-interval. Along the principal axes of the predicted covariance they are independent, so the number
-of intervals that contain the truth has a binomial distribution.
-"""
+"""Coverage of 95 % intervals, counted on independent ones: those along principal axes."""
 
 from __future__ import annotations
 
@@ -21,14 +16,9 @@ DETERMINED = 0.5
 
 
 def principal_scores(error, covariance):
-    """Independent standardised errors along the principal axes of a covariance.
+    """Independent standardised errors along the principal axes of a predicted covariance.
 
-    Args:
-        error: Estimate less truth, in prior standard deviations, shape (n,).
-        covariance: Predicted covariance of the error in the same unit, shape (n, n).
-
-    Returns:
-        Standardised errors, shape (n,), and the mask of the axes that the readings determine.
+    With the mask of the axes that the readings determine; all in prior standard deviations.
     """
     variances, axes = np.linalg.eigh(covariance)
     return axes.T @ error / np.sqrt(variances), variances < DETERMINED

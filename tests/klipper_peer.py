@@ -1,9 +1,7 @@
-"""Klipper's way to the settings of a delta printer: six parameters by coordinate descent.
+"""Klipper's coordinate descent to the settings of a delta printer (its Delta_Calibrate.md).
 
-Radius, two towers and three endstops minimise the sum of squared heights of the triggers. Each
-parameter in turn takes a step that grows by a tenth where it helps and shrinks by a tenth where it
-does not, until the steps add up to 1e-5 mm and degrees (Klipper's documents: Delta_Calibrate.md).
-With `extended` the three rods are free as well, as with distances that were measured on a print.
+A parameter's step grows by a tenth where it helps and shrinks by a tenth where it does not, until
+the steps add up to 1e-5 mm and degrees. With `extended` the three rods are free as well.
 """
 
 from __future__ import annotations
@@ -41,15 +39,7 @@ def descend(cost, start, most):
 
 
 def calibrate_as_klipper(settings, travel, trigger, *, extended=False, most=MOST_ROUNDS):
-    """New settings from the travel below the endstops at the triggers.
-
-    Args:
-        settings: Present settings, a `Firmware`.
-        travel: Shape (K, 3), [mm].
-        trigger: Height of the nozzle at the trigger, [mm].
-        extended: Whether the rods are free.
-        most: Largest number of rounds.
-    """
+    """New settings from travels below the endstops at triggers of a height, shape (K, 3), [mm]."""
 
     def unpack(values):
         rods = values[6:9] if extended else settings.rods

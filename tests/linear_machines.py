@@ -1,8 +1,6 @@
 """Linear machines with normal errors: intervals if few contrasts determine the tolerance scale.
 
-The formulas of docs/mathematics.md are written out in NumPy. Of the program only the Jacobian of
-the nominal machine and the expanded uncertainty are used. There is no test of significance: the
-scale is estimated for every machine, so that the coverage can be compared with 95 %.
+The formulas of docs/mathematics.md, in NumPy; the scale is estimated for every machine.
 """
 
 from __future__ import annotations
@@ -65,13 +63,7 @@ class LinearMachines:
         return gain, np.sqrt([np.diag(inverse), scatter, scaled])
 
     def cover(self, scale, count, *, seed=0):
-        """Share of machines whose intervals contain the truth, for each error, shape (n,).
-
-        Args:
-            scale: True tolerance scale.
-            count: Number of machines.
-            seed: Seed of errors and noise.
-        """
+        """Share of machines of a true scale whose intervals contain the truth, for each error."""
         rng = np.random.default_rng(seed)
         truth = rng.normal(size=(len(self.names), count))
         truth[self.is_scaled] *= scale

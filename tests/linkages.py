@@ -58,11 +58,7 @@ def write_crooked_loop(folder: Path) -> Path:
 
 
 def write_wide_linkage(folder: Path, extra: str = "", *, half: float = 0.3) -> Path:
-    """A planar five-bar whose motors, at 0, hold the elbows too far apart for the rods to meet.
-
-    Motors at (±half, 0), cranks of 0.1 outwards, rods of 0.3: the elbows are 2 half + 0.2 apart,
-    and the rods reach 0.6.
-    """
+    """A planar five-bar whose elbows are 2 half + 0.2 apart at 0; its rods reach 0.6."""
     joints = ""
     for side, sign in (("a", -1.0), ("b", 1.0)):
         joints += joint(f"motor_{side}", "base", (sign * half, 0, 0), "z")

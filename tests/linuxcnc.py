@@ -1,17 +1,10 @@
 """LinuxCNC in simulation, without a display: runs programs and records the slides.
 
-Debian's linuxcnc-uspace runs it and linuxcnc-uspace-dev builds modules (`.ci/run` installs both).
-If $ORTHOCAL_LINUXCNC is `required`, as in continuous integration, a test fails without them;
-otherwise it is skipped with the reason.
+Without it (Debian's linuxcnc-uspace and -dev) tests are skipped, or fail if $ORTHOCAL_LINUXCNC is
+`required`. Root runs it as `nobody`, and installs modules in its directory. One runs at a time.
 
-The real-time part of LinuxCNC refuses root. Root runs it as `nobody`, in a directory of that user.
-LinuxCNC loads modules from its own directory only, which needs root: the exported module is
-installed there for the run, and other users skip runs with a module. Only one instance can run on a
-machine, so all workers share a lock.
-
-Each joint moves a slide in HAL. The encoder coordinate of the slide is c = begin + s m, with the
-motor's position m since power-on and the direction s. A home switch closes at a position of the
-slide, independently of the coordinate that the controller displays.
+A joint moves a slide at c = begin + s m, with the motor's position m and the direction s. Its home
+switch closes at a position of the slide.
 """
 
 from __future__ import annotations
@@ -358,35 +351,18 @@ def installed(folder):
 
 
 def run_program(program, joints, **options):
-    """Slides in every servo period while a program runs, shape (K, n_joints), [mm].
-
-    Args:
-        program: Lines of G-code; the first brings the tool to the start of the path.
-        joints: Joints of the machine.
-        **options: Options of `run_programs`.
-    """
+    """Slides in every servo period, shape (K, n_joints), [mm]; see `run_programs`."""
     return run_programs([(program[:1], [*program, "M2"])], joints, **options)[0]
 
 
 def run_programs(
     runs, joints, *, letters="XYZ", lines="", module=None, files=None, halcmd=(), output=False
 ):
-    """Home the machine, then run programs one after the other.
+    """Home the machine, then run programs one after the other, each after its lines in MDI.
 
-    Args:
-        runs: For each program the lines to run in MDI before it, and its own lines.
-        joints: Joints of the machine.
-        letters: Letters of the coordinates.
-        lines: Lines that replace those of the same name in the INI.
-        module: Folder of an exported kinematics module; without it each joint is a coordinate.
-        files: Further files beside the INI, name to text.
-        halcmd: Commands for HAL at the pauses of the first program, "" for none; the joints'
-            positions are those 0.2 s later.
-        output: Whether to record digital output 0 as well, in the last column.
-
-    Returns:
-        Slides in every servo period of the first program, shape (K, n_joints), [mm]; and for each
-        program the joints' positions at its pauses (M0), shape (n_pauses, n_joints), [mm].
+    `lines` replace those of the INI, `files` are beside it, `module` is a folder of kinematics, and
+    `halcmd` are commands at the pauses of the first program. `output` records digital output 0.
+    Returns the slides of the first program, (K, n_joints), and the joints at all pauses, [mm].
     """
     require_linuxcnc()
     with only_one(), nullcontext() if module is None else installed(module):
@@ -411,16 +387,9 @@ def play(screws, backlash):
 
 
 def filter_program(ini, program, result):
-    """Filter a program as LinuxCNC's window does, with the window's functions.
+    """Filter a program with the functions of LinuxCNC's window.
 
-    Args:
-        ini: Text of the INI.
-        program: File to open.
-        result: Filtered file.
-
-    Returns:
-        Exit code of the filter, None if the INI has none for the file; its messages; and the
-        progress that the window received, in percent.
+    Returns the filter's exit code (None if the INI has none), its messages and its progress, [%].
     """
     require_linuxcnc()
     if not WINDOW.exists():

@@ -1,8 +1,6 @@
 """An Orthoglide under load by minimisation of its energy, in NumPy and SciPy alone.
 
-Each leg is a chain of rotations from its slide to the platform, with rods of any length. The energy
-is that of six springs and of a weight at the tool. It shares no formula with orthocal: neither
-Jacobians nor forces appear.
+Legs are chains of rotations with rods of any length: six springs, and a weight at the tool.
 """
 
 from __future__ import annotations
@@ -74,13 +72,7 @@ def close(drives, lengths, start):
 
 
 def settle(drives, *, stiffness, weight):
-    """Where the tool comes to rest, shape (3,), [m], and the changes of the rods' lengths, [m].
-
-    Args:
-        drives: Shape (3,), [m].
-        stiffness: Of a rod, [N/m].
-        weight: Force on the tool, shape (3,), [N].
-    """
+    """Where the tool comes to rest, shape (3,), and the changes of the rods' lengths, [m, N]."""
     nominal = np.full(6, LENGTH)
     start, at_rest = close(drives, nominal, np.zeros(18))
     unit = np.linalg.norm(weight) / stiffness

@@ -56,13 +56,7 @@ def reading_by_pinocchio(session, machine, setup, posture):
 
 
 def write_orthoglide(folder, length, *, travel=None):
-    """An Orthoglide of another leg length, as a builder writes it: both files copied and edited.
-
-    Args:
-        folder: Made anew.
-        length: Of the legs, [m].
-        travel: Least and largest drive coordinate, [m]; by default in proportion.
-    """
+    """An Orthoglide of another leg length and travel, by default in proportion, [m]."""
     source = packaged_robots()["orthoglide"]
     low, high = travel or (length * 0.12 / 0.31025, length * 0.39 / 0.31025)
     urdf = (source / "orthoglide.urdf").read_text()

@@ -121,6 +121,12 @@ def plain_mistakes() -> dict[str, Make]:
     def with_cycles(make: Make) -> Make:
         return lambda s: make(s) if s.has_cycles else None
 
+    def posture(factor: float, kind: str) -> Make:
+        return with_cycles(lambda s: s.times(s.pick(s.repeated), factor, kind))
+
+    def leg(factor: float, kind: str) -> Make:
+        return lambda s: s.times(s.of_leg(s.leg()), factor, kind)
+
     def one(factor: float, kind: str) -> Make:
         return lambda s: s.times(s.row(), factor, kind)
 
@@ -230,24 +236,20 @@ def plain_mistakes() -> dict[str, Make]:
         "cycle of a setup ten times": with_cycles(
             lambda s: s.times(s.pick(s.cycles), 10.0, "decimal point")
         ),
-        "leg in inches": lambda s: s.times(s.of_leg(s.leg()), 1 / 25.4, "wrong unit"),
-        "leg ten times": lambda s: s.times(s.of_leg(s.leg()), 10.0, "decimal point"),
+        "leg in inches": leg(1 / 25.4, "wrong unit"),
+        "leg ten times": leg(10.0, "decimal point"),
         "sign of a reading": one(-1.0, "reversed sign"),
-        "sign of a posture, all cycles": with_cycles(
-            lambda s: s.times(s.pick(s.repeated), -1.0, "reversed sign")
-        ),
+        "sign of a posture, all cycles": posture(-1.0, "reversed sign"),
         "sign of a setup": setup(-1.0, "reversed sign"),
         "sign of two setups": lambda s: s.times(
             np.concatenate(s.pick_two(s.setups)), -1.0, "reversed sign"
         ),
-        "sign of a leg": lambda s: s.times(s.of_leg(s.leg()), -1.0, "reversed sign"),
+        "sign of a leg": leg(-1.0, "reversed sign"),
         "sign of all": every(-1.0, "reversed sign"),
         "reading ten times": one(10.0, "decimal point"),
         "reading a tenth": one(0.1, "decimal point"),
         "reading a hundred times": one(100.0, "decimal point"),
-        "posture ten times, all cycles": with_cycles(
-            lambda s: s.times(s.pick(s.repeated), 10.0, "decimal point")
-        ),
+        "posture ten times, all cycles": posture(10.0, "decimal point"),
         "neighbouring rows exchanged": neighbours,
         "rows of a setup exchanged": apart,
         "rows of two setups exchanged": across,
@@ -332,12 +334,9 @@ def sound_session(plan, seed: int, *, entered: bool):
 
 
 def sound_machine(plan, seed: int, *, entered: bool):
-    """Errors of a machine with all errors at their tolerances, and a session of it.
+    """Errors of a machine at their tolerances, and a session of it.
 
-    Args:
-        plan: What is read where.
-        seed: Of the machine and its readings.
-        entered: Whether its offsets were entered, up to 20 µm, with what its errors leave.
+    With its offsets `entered`, up to 20 µm, or at 0.4 of their tolerance.
     """
     robot = plan.robot
     for attempt in range(20):

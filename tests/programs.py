@@ -149,11 +149,7 @@ def center_words(values, i, j, unit):
 
 
 def read_polyline(lines, offset=(0.0, 0.0, 0.0)):
-    """Points and feeds of a program of G0 and G1 by line number, [mm], [mm/min].
-
-    Returns:
-        Number to a list of (point, feed).
-    """
+    """Points and feeds of a program of G0 and G1 by line number, [mm], [mm/min]."""
     points, number, at = {}, 0, np.full(3, np.nan)
     unit, absolute, feed, rapid = 1.0, True, None, None
     for line in lines:
@@ -205,10 +201,7 @@ def own_distances(points, polyline):
 def rigid_motion(before, after, weights):
     """Rotation R and translation t that best map points p to R p + t (Kabsch 1976).
 
-    Args:
-        before: Points, shape (K, 3).
-        after: Their images, shape (K, 3).
-        weights: Weights of the points, shape (K,), with the sum 1.
+    The weights of the points have the sum 1.
     """
     first, second = weights @ before, weights @ after
     u, _, vt = np.linalg.svd((weights[:, None] * (after - second)).T @ (before - first))

@@ -37,10 +37,9 @@ class Outcome:
 
 
 def calibrate_machines(session, model, *, factor, count, solver="linearised", seed=0, profile=()):
-    """Calibrate machines with errors at a factor of their tolerances, offsets at theirs.
+    """Calibrate machines with errors of `full` at a factor of their tolerances, offsets at theirs.
 
-    The machines have the errors of `full` and random noise; gauges are mounted with errors.
-    Profile-likelihood intervals are computed of the offsets whose names are in `profile`.
+    The offsets named in `profile` have profile-likelihood intervals.
     """
     parameters = session.robot.parameters
     names = parameters.select_model("full")

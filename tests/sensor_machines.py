@@ -44,15 +44,9 @@ class Outcome:
 
 
 def calibrate_machines(plan, space, *, count=MACHINES, offset_std=0.5e-3, read=None):
-    """Calibrate machines, in closed loops.
+    """Calibrate machines over a workspace, in closed loops, from a plan with one gauge.
 
-    Args:
-        plan: Plan with one gauge.
-        space: Workspace.
-        count: Number of machines.
-        offset_std: Prior standard deviation of the offsets, [m].
-        read: Exact readings, shape (count, n_rows), from errors and nuisance parameters, shape
-            (count, n_free); by default those of the observation model.
+    `read` returns exact readings of errors and nuisance parameters; by default the model's.
     """
     problem = build_problem(plan, model="full", prior_stds={"*.offset": offset_std})
     n, scale = problem.n_machine, problem.theta_scale

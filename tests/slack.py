@@ -1,8 +1,4 @@
-"""An effect for tests that acts in all possible ways.
-
-A drive lags by half its slack in the direction of its last motion, and its screw has a periodic
-error. Rods grow with the temperature, and readings change linearly with time.
-"""
+"""An effect for tests that depends on approach, position, temperature and time."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
-"""Complete use of the command line on a machine with legs of 250 mm, up to a better part.
+"""Complete use of the command line on simulated machines at their tolerances, up to a better part.
 
-new → check → calibrate → enter → calibrate → export → LinuxCNC. The machine is simulated with all
-errors at their tolerances and realistic gauge misalignment. `test_ball_bar_use.py` has `record`.
-
-With effects beside geometry: new → simulate → calibrate → export → again → simulate → validate →
-calibrate both → correct. The independent simulator makes the part.
+new → check → calibrate → enter → calibrate; and with effects new → simulate → calibrate → export →
+again → simulate → validate → calibrate both → correct.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ from adjusting import aligned_rms
 from commands import run_orthocal
 from conftest import no_sensor_gains
 from independent import Expansion, IndependentMachine, States
-from linuxcnc import Joint, play, require_linuxcnc, run_program
+from linuxcnc import play
 from programs import read_polyline
 from uncompared import uncompared
 
@@ -103,40 +100,6 @@ def test_actual_tool_error_is_the_expected_one(two_rounds):
     assert two.assessment.tool.compensated == pytest.approx(expected)
 
 
-@pytest.mark.slow
-def test_linuxcnc_moves_the_calibrated_machine(two_rounds):
-    """The actual machine with the recorded joints has the errors that the calibration expects."""
-    require_linuxcnc()
-    folder, errors, _, two, _ = two_rounds
-    printed = run(folder, "export", "two", "--to", "linuxcnc", "--out", "cnc", "--within", "0.5")
-    assert printed.split() == ["Next:", "follow", "cnc/README.md."]
-    corners = [(30, -30, 20), (-40, 10, -30), (10, 40, 30)]
-    program = [
-        f"G21 G90 G61 {'G1 ' if i == 0 else ''}X{x} Y{y} Z{z} F6000"
-        for i, (x, y, z) in enumerate(corners)
-    ]
-    switch = (270.0, 260.0, 265.0)
-    joints = [
-        Joint(
-            d.direction,
-            s,
-            float(d.to_joint(s * MM + active)) / MM,
-            float(d.to_joint(d.zero)) / MM,
-        )
-        for d, s, active in zip(two.robot.drives, switch, two.active_offsets, strict=True)
-    ]
-    lines = (folder / "cnc/kinematics.ini").read_text()
-    slides = run_program(program, joints, lines=lines, module=folder / "cnc")[::20] * MM
-    commanded = two.machine.forward(slides)
-    assert np.linalg.norm(commanded[-1] / MM - corners[-1]) < 1e-3
-    assert len(commanded) > 30
-    deviation = Machine(two.robot, errors).forward(slides) - commanded
-    exact = Machine(two.robot, errors).forward(two.machine.inverse(commanded)) - commanded
-    assert np.abs(deviation - exact).max() < 1e-9
-    expected = assess_tool(two).after.sizes
-    assert np.sqrt(np.mean(np.sum(deviation**2, axis=1))) < 3.0 * expected.absolute.rms
-
-
 EFFECTS = "--tolerance *.offset_mm=2 --effects backlash,thermal"
 TEMPERATURES = "18:26", "19:27"
 """Temperatures of the first and the last reading of both sessions, [°C]."""
@@ -197,8 +160,7 @@ def warming_machine(tmp_path_factory, short_reports):
 def drill(folder, program):
     """Error of the actual holes after alignment of the part, RMS, [m].
 
-    The controller has nominal kinematics, the offsets and the backlash of the second session. The
-    machine is that of the independent simulator; its slides have backlash.
+    The controller has nominal kinematics and the offsets and the backlash of the second session.
     """
     both, bare = load_calibration(folder / "both"), folder / "bare"
     robot = both.robot

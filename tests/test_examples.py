@@ -18,7 +18,6 @@ from uncompared import uncompared
 
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
-from orthocal.assessment import judgement
 from orthocal.effects import registry as effect_registry
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.simulate import load_errors
@@ -26,30 +25,12 @@ from orthocal.planning import selection
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
-pytestmark = [pytest.mark.acceptance, pytest.mark.usefixtures("short_reports")]
+pytestmark = [
+    pytest.mark.acceptance,
+    pytest.mark.usefixtures("short_reports", "judged_sessions"),
+]
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def judged_once():
-    """Readings that several pages calibrate are judged once."""
-    judge, judged = judgement.judge_session, {}
-
-    def judge_once(session):
-        parameters = session.robot.parameters
-        key = session.sha256, session.robot.sha256, str(parameters.stated), parameters.names
-        if not session.sha256:
-            return judge(session)
-        if key not in judged:
-            judged[key] = judge(session)
-        return judged[key]
-
-    with (
-        patch.object(judgement, "judge_session", judge_once),
-        patch.object(orthocal, "judge_session", judge_once),
-    ):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -144,20 +125,13 @@ def test_python_of_a_page_runs(make_directory, registries, page):
         assert (done.returncode, done.stderr) == (0, "")
 
 
-class Printed(dict):
-    """What each command of a page prints, and the directory in which they ran."""
-
-    directory = None
-
-
 @pytest.fixture(scope="module")
 def run_page(make_directory, short_reports):
-    """Function that runs the commands of a page in order, once; returns what each prints."""
+    """Function that runs the commands of a page in order, once: its directory, what each prints."""
 
     @cache
     def run(page):
-        printed = Printed()
-        printed.directory = make_directory()
+        directory, printed = make_directory(), {}
         reports = nullcontext() if page in WITH_REPORTS else marked_reports()
         plans = nullcontext() if page in SHOWN else patch.object(selection, "MIN_STARTS", 1)
         with reports, plans, no_sensor_gains():
@@ -167,17 +141,17 @@ def run_page(make_directory, short_reports):
                 else:
                     quick = uncompared() if page in SHOWN else plans_of_few_candidates()
                 with quick:
-                    done = run_line(printed.directory, command)
+                    done = run_line(directory, command)
                 assert done.returncode == expected, f"{command}: {done.stderr}"
                 printed[command] = done.stdout
-        return printed
+        return directory, printed
 
     return run
 
 
 @pytest.mark.parametrize("page", [p for p in with_code("sh") if p != TUTORIAL])
 def test_commands_of_a_page_run(run_page, page):
-    assert run_page(page)
+    assert run_page(page)[1]
 
 
 def test_tutorial_shows_what_its_commands_print(root, tmp_path):
@@ -208,7 +182,7 @@ def test_tutorial_shows_what_its_commands_print(root, tmp_path):
 @pytest.mark.parametrize(("page", "texts"), SHOWN.items())
 def test_a_page_shows_what_its_commands_print(root, run_page, page, texts):
     """A text that follows commands shows lines that the last of them prints."""
-    printed, last, shown = run_page(page), "", 0
+    (_, printed), last, shown = run_page(page), "", 0
     text = (root / page).read_text()
     for language, block in re.findall(r"```(\w+)\n(.*?)```", text, flags=re.DOTALL):
         if language == "sh":
@@ -233,7 +207,7 @@ def test_a_page_shows_what_is_in_a_file(root, run_page, page, start, file):
     text = (root / page).read_text()
     assert file in text
     (shown,) = re.findall(rf"```(?:ini|yaml)\n({re.escape(start)}.*?)```", text, flags=re.DOTALL)
-    assert shown in (run_page(page).directory / file).read_text()
+    assert shown in (run_page(page)[0] / file).read_text()
 
 
 def test_reference_has_every_name(root):
@@ -265,7 +239,7 @@ def test_results_on_a_page_are_what_the_command_prints(root, run_page, page, tit
     """The page states the command, or the command without --out."""
     shown = next(b for b in blocks("text", page) if title in b)
     of_page = f"orthocal {command}" in [c for c, _ in commands(page)]
-    out = run_page(page)[f"orthocal {command}"] if of_page else output_of(root, command)
+    out = run_page(page)[1][f"orthocal {command}"] if of_page else output_of(root, command)
     assert of_page == ("--out" in command)
     printed = [line.rstrip() for line in out.splitlines()]
     lines = [line.rstrip() for line in shown.splitlines()]

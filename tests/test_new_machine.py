@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import pty
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 import yaml
 from calibrated import identified
-from commands import orthocal
+from commands import Terminal, orthocal
 from folders import files_of
 from lxml import etree
 
@@ -29,21 +27,16 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.sheet import page
-from orthocal.planning import tool_candidates
+from orthocal.planning import first_plan
 from orthocal.planning.equipment import USUAL_BALL
+from orthocal.planning.sensor_gains import SensorGain
 from orthocal.session.session import Purpose
 
 pytestmark = pytest.mark.usefixtures("short_reports")
 
-SIZES = {
-    "--leg-mm": "250",
-    "--travel-mm": "100:320",
-    "--attachment-mm": "30",
-    "--rods-apart-mm": "60",
-    "--rod-radius-mm": "4",
-    "--counts": "up,down,up",
-    "--at-zero-mm": "0",
-}
+DIMENSIONS = """--leg-mm 250 --travel-mm 100:320 --attachment-mm 30 --rods-apart-mm 60
+--rod-radius-mm 4 --counts up,down,up --at-zero-mm 0""".split()
+SIZES = dict(zip(DIMENSIONS[::2], DIMENSIONS[1::2], strict=True))
 QUICK = ["--solver", "variable-projection"]
 PROGRAMS = [f"{i:02d}-{name}.ngc" for i, name in enumerate("yx zx xy zy xz yz".split(), 1)]
 
@@ -120,23 +113,19 @@ def test_a_new_machine_has_screws_of_a_lead(tmp_path):
     robot = load_robot(folder)
     assert robot.effect_names == ("backlash", "screw")
     assert [e.period for e in robot_effects(robot) if e.period] == pytest.approx([5e-3])
-    for lead in ("0", "-5", "nan", "500"):  # the travel is shorter
-        words = (tmp_path / "bad", *options(), "--paper", "--screw-lead-mm", lead)
-        code, _, err = orthocal("new", *words)
-        assert code == 2
-        assert err.startswith("orthocal: --screw-lead-mm: ")
-        assert not (tmp_path / "bad").exists()
 
 
 @pytest.mark.parametrize(
-    ("effects", "message"),
+    ("words", "message"),
     [
-        ("rust", "--effects: found 'rust'; expected one of"),
-        ("screw", "--screw-lead-mm: is missing"),
+        ("--effects rust", "--effects: found 'rust'; expected one of"),
+        ("--effects screw", "--screw-lead-mm: is missing"),
+        *((f"--screw-lead-mm {lead}", "--screw-lead-mm: ") for lead in ("0", "-5", "nan", "500")),
     ],
 )
-def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
-    code, _, err = orthocal("new", tmp_path / "mill", *options(), "--effects", effects)
+def test_wrong_effects_are_refused(tmp_path, words, message):
+    """A lead of 500 mm is longer than the travel."""
+    code, _, err = orthocal("new", tmp_path / "mill", *options(), "--paper", *words.split())
     assert code == 2
     assert f"orthocal: {message}" in err
     assert not (tmp_path / "mill").exists()
@@ -184,16 +173,6 @@ def test_numbers_of_drives_are_those_of_the_controller(made):
         assert place in str(refused.value)
 
 
-def test_a_posture_beyond_the_travel_is_named_with_the_controllers_number(copied):
-    file = copied / "first/session.yaml"
-    text = file.read_text()
-    assert "y_max:\n    tcp_mm: [0.0, 60.0, 0.0]" in text
-    file.write_text(text.replace("tcp_mm: [0.0, 60.0, 0.0]", "joints_mm: [250.0, 330.0, 250.0]"))
-    code, _, err = orthocal("check", copied / "first")
-    assert code == 2
-    assert "y_slide would be at -80.000 mm; it reaches from -70 to 150 mm" in err
-
-
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):
     """1.5 mm in one drive's zero come back, the controller counting down or not."""
     out = tmp_path / "try"
@@ -212,8 +191,7 @@ def test_what_is_read_on_it_calibrates_it(made, tmp_path):
 
 
 def test_a_machine_is_made_again_after_a_change(copied):
-    file = copied / "machine.yaml"
-    file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
+    replace_in("machine.yaml", "leg_mm: 250", "leg_mm: 260")(copied)
     code, out, _ = orthocal("new", copied, "--again")
     assert code == 0
     assert f"Made {copied}/first/sheet.html and its programs again." in out
@@ -320,20 +298,6 @@ def test_the_workspace_is_written_and_a_plan_for_another_one_is_old(planned, tmp
     assert load_robot(mill).drives[0].lower == pytest.approx(0.09)
 
 
-def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
-    file = copied / "machine.yaml"
-    text = file.read_text()
-    line = "# workspace_mm: [[-60, 60], [-60, 60], [-60, 60]]"
-    assert line in text
-    file.write_text(text.replace(line, "workspace_mm: [[-90, 90], [-90, 90], [-90, 90]]"))
-    before = files_of(copied)
-    code, _, err = orthocal("new", copied, "--again")
-    assert code == 2
-    assert err.startswith(f"orthocal: {file}: workspace_mm: the machine does not reach the workspa")
-    assert "; the largest box of this shape is ±" in err
-    assert files_of(copied) == before
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -351,6 +315,68 @@ def test_options_of_a_plan_are_refused_with_again(copied, words):
     assert files_of(copied) == before
 
 
+def write(file, content):
+    return lambda folder: (folder / file).write_text(content)
+
+
+def replace_in(file, old, new):
+    def change(folder):
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new))
+
+    return change
+
+
+SPOILT = {
+    "a workspace out of reach": (
+        replace_in(
+            "machine.yaml",
+            "# workspace_mm: [[-60, 60], [-60, 60], [-60, 60]]",
+            "workspace_mm: [[-90, 90], [-90, 90], [-90, 90]]",
+        ),
+        "machine.yaml: workspace_mm: the machine does not reach the workspace ±90 mm",
+    ),
+    "a posture beyond the travel": (  # with the controller's number
+        replace_in("first/session.yaml", "tcp_mm: [0.0, 60.0, 0.0]", "joints_mm: [250, 330, 250]"),
+        "y_slide would be at -80.000 mm; it reaches from -70 to 150 mm",
+    ),
+    "files of two robots": (
+        lambda folder: (
+            [shutil.copy(folder / "mill.urdf", folder / f"{k}.urdf") for k in "ab"]
+            and (folder / "mill.urdf").unlink()
+        ),
+        "one URDF file, or one named mill.urdf; found a.urdf, b.urdf",
+    ),
+    "dimensions alone": (
+        lambda folder: (folder / "mill.yaml").unlink(),
+        "contains machine.yaml but no YAML of a robot",
+    ),
+    **{
+        f"a plan of {content}": (write(f"first/{file}", content), f"mill/first/{file}:")
+        for file, content in (
+            *(("plan.json", "5"), ("plan.json", "null"), ("plan.json", "{")),
+            ("session.yaml", "robot: ["),
+        )
+    },
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_spoilt_machines_are_refused(copied, name):
+    spoil, message = SPOILT[name]
+    spoil(copied)
+    before = files_of(copied)
+    by_check = name in ("a posture beyond the travel", "files of two robots")
+    words = ["check", copied / "first"] if by_check else ["new", copied, "--again"]
+    code, _, err = orthocal(*words)
+    assert code == 2
+    assert message in err
+    assert ("does not reach" in err) == ("workspace" in name)
+    assert ("; the largest box of this shape is ±" in err) == ("workspace" in name)
+    assert files_of(copied) == before
+
+
 def test_a_renamed_directory_works(copied):
     """machine.yaml is not the robot's; the files keep their names, also if made again."""
     before = load_robot(copied)
@@ -358,31 +384,15 @@ def test_a_renamed_directory_works(copied):
     assert load_robot(renamed).sha256 == before.sha256
     assert load_plan(renamed / "first").robot.name == "lathe"
     names = set(files_of(renamed))
-    file = renamed / "machine.yaml"
-    file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
+    replace_in("machine.yaml", "leg_mm: 250", "leg_mm: 260")(renamed)
     code, _, err = orthocal("new", renamed, "--again")
     assert (code, err) == (0, "")
     assert set(files_of(renamed)) == names
     assert load_robot(renamed).drive_zero == pytest.approx([0.26] * 3)
 
 
-def test_a_directory_with_files_of_two_robots_is_refused(copied):
-    renamed = copied.rename(copied.with_name("lathe"))
-    (renamed / "other.urdf").write_bytes((renamed / "mill.urdf").read_bytes())
-    code, _, err = orthocal("check", renamed / "first")
-    assert code == 2
-    assert "one URDF file, or one named lathe.urdf; found mill.urdf, other.urdf" in err
-
-
-def test_dimensions_alone_are_no_robot(copied):
-    (copied / "mill.yaml").unlink()
-    code, _, err = orthocal("new", copied, "--again")
-    assert (code, "contains machine.yaml but no YAML of a robot" in err) == (2, True)
-
-
 def test_sheets_with_readings_stay_unchanged(copied):
-    csv = copied / "first/readings.csv"
-    csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
+    replace_in("first/readings.csv", "yx,zero,1,", "yx,zero,1,0.12")(copied)
     before = (copied / "first/sheet.html").read_text()
     code, out, err = orthocal("new", copied, "--again")
     assert code == 0
@@ -392,30 +402,17 @@ def test_sheets_with_readings_stay_unchanged(copied):
 
 
 def test_a_plan_out_of_reach_is_old(copied):
-    file = copied / "machine.yaml"
-    file.write_text(file.read_text().replace("[100, 320]", "[200, 320]"))
+    replace_in("machine.yaml", "[100, 320]", "[200, 320]")(copied)
     code, _, err = orthocal("new", copied, "--again")
     assert code == 3
     assert "first/session.yaml: postures.x_min: " in err
     assert "first: the plan is old (the machine does not reach its postures); plan again" in err
-    csv = copied / "first/readings.csv"  # which `plan --force` would not replace
-    csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
+    # which `plan --force` would not replace
+    replace_in("first/readings.csv", "yx,zero,1,", "yx,zero,1,0.12")(copied)
     code, _, err = orthocal("new", copied, "--again")
     assert code == 3
     assert "it has readings, so check the dimensions" in err
     assert "--force" not in err
-
-
-@pytest.mark.parametrize(
-    ("file", "content"),
-    [("plan.json", "5"), ("plan.json", "null"), ("plan.json", "{"), ("session.yaml", "robot: [")],
-)
-def test_a_damaged_plan_is_not_called_out_of_reach(copied, file, content):
-    (copied / "first" / file).write_text(content)
-    code, _, err = orthocal("new", copied, "--again")
-    assert code == 2
-    assert err.startswith(f"orthocal: {copied}/first/{file}:")
-    assert "does not reach" not in err
 
 
 @pytest.mark.usefixtures("unsheeted")
@@ -429,28 +426,6 @@ def test_existing_files_are_not_overwritten(copied):
     code, _, _ = orthocal(*given, "--force")
     assert code == 0
     assert load_robot(copied).drive_zero == pytest.approx([0.26] * 3)
-
-
-def talk(command, answers, cwd):
-    """What a program says at a terminal when it is given answers, one at each prompt."""
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=cwd, close_fds=True
-    )
-    os.close(theirs)
-    said, rest = b"", list(answers)
-    while True:
-        try:
-            part = os.read(ours, 4096)
-        except OSError:  # the other end is closed
-            break
-        if not part:
-            break
-        said += part
-        if rest and said.endswith(b": "):
-            os.write(ours, rest.pop(0).encode())
-    os.close(ours)
-    return process.wait(timeout=300), said.decode(errors="replace").replace("\r\n", "\n")
 
 
 @pytest.mark.usefixtures("unsheeted")
@@ -478,25 +453,17 @@ def test_invalid_answers_are_asked_for_again(tmp_path):
     assert offset_limits(tmp_path / "mill") == [3.0, 3.0, 3.0]
 
 
-def test_nothing_is_written_when_the_input_ends(root, tmp_path):
-    command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
-    code, said = talk(command, ["250\n", "\x04"], root)
+def test_nothing_is_written_when_the_input_ends(tmp_path):
+    words = "new", tmp_path / "mill", "--paper"
+    code, _, err = orthocal(*words, typed="250\n", terminal=True)
     assert code == 2
-    assert "orthocal: --travel-mm: was not answered: the input ended" in said
+    assert "orthocal: --travel-mm: was not answered: the input ended" in err
     assert not (tmp_path / "mill").exists()
 
 
 def test_options_are_not_asked_for(monkeypatch):
     """At a terminal, too; what is missing is asked for in its place."""
-
-    class Terminal:
-        def isatty(self):
-            return True
-
-        def readline(self):
-            return "260\n"
-
-    monkeypatch.setattr(sys, "stdin", Terminal())
+    monkeypatch.setattr(sys, "stdin", Terminal(io.BytesIO(b"260\n" * 2)))
     given = {
         option.strip("-").replace("-", "_"): asking.Stated(option, text)
         for option, text in SIZES.items()
@@ -544,13 +511,15 @@ DELTA = [
 
 @pytest.mark.usefixtures("unsheeted")
 def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path, monkeypatch):
-    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:3])
+    """`test_sensor_gains.py` has the gains."""
+    searched, gains = [], (SensorGain("a ball bar", 1, 30, 60.0, 31e-6),)
+    monkeypatch.setattr(first_plan, "find_sensor_gains", lambda *of: searched.append(of) or gains)
     code, said, _ = orthocal("new", tmp_path / "delta", *DELTA)
     assert code == 0
     assert "Plan: 26 readings (1 closing) in 1 setup" in said
-    gains = re.search(r"Another hour, with all errors corrected: ([\d.]+) mm with (.*?);", said)
-    assert gains[2] == "a ball bar of 50 mm"
-    assert float(gains[1]) < 0.04
+    assert "Another hour, with all errors corrected: 0.031 mm with a ball bar" in said
+    ((forecast, planned, expected),) = searched
+    assert expected.reported.rms == forecast.after(planned).reported.rms
     session = load_plan(tmp_path / "delta/first")
     assert {s.sensor.kind for s in session.setups.values()} == {"tool_indicator"}
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
@@ -573,17 +542,3 @@ def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path, wit
     assert "yaml" not in err
     box = "--workspace-mm=-40:40,-40:40,0:11"
     assert orthocal("new", tmp_path / "delta", *short, box).returncode == 0
-
-
-@pytest.mark.usefixtures("unsheeted")
-def test_stated_sensors_are_planned(tmp_path, quick_plans, without_sensor_gains):
-    bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
-    (tmp_path / "bar.yaml").write_text(bar)
-    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.4", "--tolerance", "*.offset_mm=1"]
-    code, said, err = orthocal("new", tmp_path / "delta", *DELTA, *words)
-    assert code == 0, err
-    session = load_plan(tmp_path / "delta/first")
-    assert "ball_bar" in {s.sensor.kind for s in session.setups.values()}
-    assert not any("u" in r.approach for r in session.readings)  # backlash needs a side
-    assert json.loads((tmp_path / "delta/first/plan.json").read_text())["setups"]
-    assert float(re.search(r"([\d.]+) mm after a second", said)[1]) < 0.1

@@ -9,6 +9,8 @@ from unittest.mock import patch
 import pytest
 from calibrated import EXPERIMENT_2, calibrated
 from commands import run_orthocal
+from conftest import marked_pictures
+from folders import files_of
 from linuxcnc import few_nodes
 
 from orthocal import write_calibration
@@ -17,14 +19,18 @@ from orthocal.export.linuxcnc import approximation, export
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cheap_results(short_reports):
+def cheap_results(short_reports, judged_sessions):
     """Short reports, and one module of few nodes: complete ones have tests of their own."""
 
     @cache
     def approximate(**options):
         return approximation.approximate(calibrated(EXPERIMENT_2), **options)
 
-    with few_nodes(), patch.object(export, "approximate", lambda _, **o: approximate(**o)):
+    with (
+        few_nodes(),
+        marked_pictures(),
+        patch.object(export, "approximate", lambda _, **o: approximate(**o)),
+    ):
         yield
 
 
@@ -100,11 +106,11 @@ def test_lines_for_a_controller_are_not_replaced_by_others(folder):
     edited = entered.replace("HOME_OFFSET = ", "HOME_OFFSET = 1", 1)
     for text, options in ((entered, ()), (edited, homes)):
         lines.write_text(text)
-        before = {p.name: p.read_bytes() for p in (folder / "out").iterdir()}
+        before = files_of(folder / "out")
         done = run_orthocal(folder, *words, *options)
         assert done.returncode == 2
         assert "out/joints.ini: contains other lines" in done.stderr
-        assert {p.name: p.read_bytes() for p in (folder / "out").iterdir()} == before
+        assert files_of(folder / "out") == before
     assert run_orthocal(folder, *words, *homes, "--force").returncode == 0
     assert lines.read_text() == entered
 
@@ -138,11 +144,11 @@ def test_measured_readings_are_never_replaced(folder):
         ("trace", "session", f"yx={trace}"),
     ):
         for force in ([], ["--force"]):
-            before = {p.name: p.read_bytes() for p in (folder / "session").iterdir()}
+            before = files_of(folder / "session")
             done = run_orthocal(folder, *words, "--out", "session", *force)
             assert done.returncode == 2, words
             assert ("does not overwrite" if force else "exists already") in done.stderr
-            assert {p.name: p.read_bytes() for p in (folder / "session").iterdir()} == before
+            assert files_of(folder / "session") == before
 
 
 INVALID = {
@@ -154,16 +160,17 @@ INVALID = {
 }
 
 
-@pytest.mark.parametrize("invalid", INVALID)
+TABLES = [
+    ("setup;posture;cycle;reading_mm\nyx;zero;1;-0,02\nyx;x_max;1;\n", "1 reading,"),
+    ("setup,posture,x_mm,y_mm,z_mm\ntrack,a,1.5,2,3\n", "1 reading,"),
+    ("Aufbau\tStellung\tMesswert\nyx\tzero\t0,5\nyx\tx_max\t.3\n", "2 readings"),
+]
+AS_MEASURED = (None, "6 readings")
+
+
 @pytest.mark.parametrize(
-    ("table", "count"),
-    [
-        (None, "6 readings"),
-        ("setup;posture;cycle;reading_mm\nyx;zero;1;-0,02\nyx;x_max;1;\n", "1 reading,"),
-        ("setup,posture,x_mm,y_mm,z_mm\ntrack,a,1.5,2,3\n", "1 reading,"),
-        ("Aufbau\tStellung\tMesswert\nyx\tzero\t0,5\nyx\tx_max\t.3\n", "2 readings"),
-    ],
-    ids=["as measured", "semicolons", "points", "other headings"],
+    ("invalid", "table", "count"),
+    [*((name, *AS_MEASURED) for name in INVALID), *(("no YAML", *table) for table in TABLES)],
 )
 def test_readings_of_a_session_that_does_not_load_are_not_replaced(folder, invalid, table, count):
     change, session = INVALID[invalid], folder / "session/session.yaml"

@@ -1,10 +1,7 @@
 """One command of each group, as a user runs it: exit code 0 and no warning.
 
-Continuous integration runs this file and the tests of the symbolic kinematics on the oldest and
-newest Python and with the lowest versions that pyproject.toml allows (`.ci/smoke.py`). `make test`
-leaves it out: the commands of the pages (`test_examples.py`) and of the wheel (`test_package.py`)
-are the same. The main job runs in a process of its own, where a warning of a library is printed on
-stderr; the other commands run in the process of the tests, where it is an error.
+`.ci/smoke.py` runs this file on other Pythons and with the lowest versions that pyproject.toml
+allows. In the main job, a process of its own, a warning of a library is printed on stderr.
 """
 
 from __future__ import annotations

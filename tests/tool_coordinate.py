@@ -1,7 +1,4 @@
-"""A sensor of the tests' own: an indicator that follows a coordinate of the tool.
-
-Its scale has an error, a nuisance parameter that all setups with the same `dial` share.
-"""
+"""An indicator that follows a coordinate of the tool; setups of the same `dial` share its scale."""
 
 from __future__ import annotations
 

@@ -26,11 +26,7 @@ ENTERED = 0.02
 def plan_with_conditions(setups=None, *, pace=1.0):
     """A plan for a dial of 0.01 mm, each posture approached from both sides while it gets warmer.
 
-    Each setup ends with its first reading.
-
-    Args:
-        setups: Names of its setups; all six by default.
-        pace: Minutes between the readings.
+    A setup ends with its first reading; `pace` are the minutes between readings.
     """
     plan = effect_plan(setups=setups)
     plan = plan.with_gauge(replace(plan.gauge, sigma=SIGMA, resolution=STEP))
@@ -55,12 +51,7 @@ def _closed(plan, setup):
 def read_machines(plan, effect, count, *, level=1.0, seed=0):
     """Readings of machines drawn from their tolerances, shape (count, n_rows), [m].
 
-    Args:
-        plan: What is read where.
-        effect: The effect that they have, or None.
-        count: Number of machines.
-        level: Factor of the tolerances of the effect.
-        seed: Of the random numbers.
+    `level` is a factor of the tolerances of their effect, if they have one.
     """
     machine = plan.with_effects([effect] if effect else [])
     problem = build_problem(machine, free=machine_errors(machine.robot), prior=True)

@@ -1,8 +1,4 @@
-"""Readings as a workshop takes them: a dial that stands crooked beside a rod, found by touching.
-
-Rods are where Pinocchio has them, and the plunger moves until the distance between two solids is
-none: nothing here is a formula of orthocal's.
-"""
+"""Readings of a dial that stands crooked beside a rod: the plunger moves until two solids touch."""
 
 from __future__ import annotations
 
@@ -41,12 +37,7 @@ def draw_crooked(rng, *, direction=10e-3, place=0.5e-3):
 
 
 class Workshop:
-    """A machine with given errors, and what dials show of its rods.
-
-    Args:
-        session: Postures and setups, with a rod and a tip each.
-        errors: Of the machine, name to value, [SI].
-    """
+    """A machine with errors, [SI], and what dials of a session show of its rods."""
 
     def __init__(self, session, errors):
         self.session = session
@@ -134,11 +125,7 @@ def _between(root, end, edge):
 
 
 def _touch(distance, touching):
-    """How far a plunger is out when its tip touches; NaN where it passes.
-
-    The distance is convex: towards where it is least until the solids overlap, then outwards to
-    where they no longer do.
-    """
+    """How far a plunger is out when its tip touches (NaN: passes). The distance is convex."""
     low, far = -0.1, 0.1
     high = far
     for _ in range(80):
