@@ -12,10 +12,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from adjusting import shimmed_plan
-from bounds import rms_band
 from calibrated import identified
 from models import JOINTS
-from planned import FEW, QUICK
+from planned import FEW, QUICK, assert_machines_have_the_expected_error
 from uncompared import few_machines, uncompared
 
 from orthocal import (
@@ -30,8 +29,6 @@ from orthocal import (
 from orthocal.builder.build import make_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ParameterError, SessionError
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import cube
@@ -132,42 +129,8 @@ def test_the_picture_of_a_plan_states_when_errors_are_expected_and_shows_all_pla
     assert papers.get_markersize() > 1.3 * even.get_markersize() > 1.6 * this.get_markersize()
 
 
-def assert_machines_have_the_expected_error(plan, *, machines):
-    """Compare tool errors of calibrated machines, in closed loops, with the expected error.
-
-    All errors of the machine and of the mounting are drawn; offsets are small.
-    """
-    robot, workspace = plan.session.robot, plan.forecast.workspace
-    problem = CalibrationProblem(plan.session, plan.forecast.selection)
-    rng = np.random.default_rng(0)
-    names = problem.machine_selection.names
-    n = len(names)
-    theta = rng.normal(size=(machines, problem.n_free)) * problem.theta_scale
-    for seed in range(machines):
-        drawn = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 0.4})
-        theta[seed, :n] = [drawn[name] for name in names]
-    sigma = float(np.hypot(5e-6, 10e-6 / np.sqrt(12.0)))
-    values, _, reached = problem.simulate(theta)
-    assert reached.all()
-    values = values + sigma * rng.normal(size=values.shape)
-    fitted = BatchSolver(problem).solve(values, sigma=sigma).theta
-    closure, columns = LoopClosure(robot), problem.functions.errors.unit_errors(names)
-    drives = closure.inverse(workspace.points)
-
-    def tools(values):
-        errors = closure.errors() + values[:, :n] @ columns.T
-        return closure.tcp(drives, closure.close(drives, errors=errors), errors=errors)
-
-    remaining = np.moveaxis(tools(fitted) - tools(theta), 0, -1)
-    aligned = workspace.remove_motion(remaining, workspace.points)
-    rms = float(np.sqrt(np.mean(workspace.weights @ (aligned**2).sum(axis=1))))
-    field = plan.forecast.align(plan.forecast.jacobian)
-    low, high = rms_band(field, workspace.weights, plan.expected.covariance, machines)
-    assert low < rms / plan.expected.reported.rms < high
-
-
 def test_calibrated_machines_have_the_expected_tool_error(planned):
-    assert_machines_have_the_expected_error(planned, machines=25)
+    assert_machines_have_the_expected_error(planned, offset_mm=0.4)
 
 
 def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):

@@ -9,10 +9,10 @@ from datetime import timedelta
 import numpy as np
 import pytest
 from commands import run_orthocal
+from planned import calibrate_drawn
 from uncompared import uncompared
 
 from orthocal import (
-    draw_errors,
     load_plan,
     simulate_session,
     write_session,
@@ -20,8 +20,6 @@ from orthocal import (
 from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
@@ -88,19 +86,10 @@ def test_readings_with_one_approach_do_not_determine_backlash(planned):
 
 @pytest.mark.slow
 def test_backlash_of_calibrated_machines_is_within_the_expected_limits(planned):
-    problem = CalibrationProblem(planned.session, planned.forecast.selection)
-    names, rng, count = problem.machine_selection.names, np.random.default_rng(0), 60
-    robot, scale = problem.session.robot, problem.theta_scale
-    theta = rng.normal(size=(count, problem.n_free)) * scale
-    for seed in range(count):
-        drawn = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 0.4})
-        theta[seed, : len(names)] = [drawn[n] for n in names]
-    values, _, reached = problem.simulate(theta)
-    assert reached.all()
-    sigma = stated_sigma(problem.session.gauge)
-    fit = BatchSolver(problem).solve(values + sigma * rng.normal(size=values.shape), sigma=sigma)
+    problem, theta, found = calibrate_drawn(planned, 60, offset_mm=0.4)
+    names = problem.machine_selection.names
     indices = [i for i, name in enumerate(names) if name.endswith(".backlash")]
-    deviation, true = (fit.theta - theta)[:, indices], theta[:, indices]
+    deviation, true = (found - theta)[:, indices], theta[:, indices]
     # near 0, where it cannot be negative, backlash is known better; the RMS of about 110 values
     # scatters by 7 %, and is 4 % larger, because the prior reduces the estimates
     expected = planned.forecast.about_nominal(planned.session)

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from ball_bar_plans import RADIUS_MM, circles
 from bounds import bound_um
 from calibrated import identified
 from machines import frame_pose
@@ -25,47 +26,7 @@ from orthocal.output.text.tables import render_sensors
 from orthocal.sensors.ball_bar import SAGITTA, BallBar
 from orthocal.units import MM
 
-RADIUS_MM, POINTS = 50.0, 16
 ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.5e-3}
-LEGS = """  leg_{d}{leg}: {{leg: {leg}, direction: {d}, section: {{fraction: 0.5}}, gauge: dial,
-    postures: [zero, {leg}_max, {leg}_min]}}"""
-
-
-def circles(folder, *, length="unknown", legs=False, keys="", zero="known", tool=(0, 0, 0)):
-    """Plan with three circles of a bar about one fixed ball, and the paper's readings of legs."""
-    postures, setups = ["  zero: {tcp_mm: [0, 0, 0]}"], []
-    for plane, (i, j) in {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}.items():
-        names = []
-        for k, angle in enumerate(2.0 * np.pi * np.arange(POINTS) / POINTS):
-            point = np.zeros(3)
-            point[[i, j]] = RADIUS_MM * np.cos(angle), RADIUS_MM * np.sin(angle)
-            names.append(f"{plane}_{k}")
-            postures.append(f"  {names[-1]}: {{tcp_mm: {point.round(9).tolist()}}}")
-        setups.append(
-            f"  {plane}: {{sensor: ball_bar, centre_mm: {list(tool)}, ball: post, gauge: bar, "
-            f"length_mm: {RADIUS_MM}, length_tolerance_mm: {length}, zero: {zero}{keys}, "
-            f"tool_mm: {list(tool)}, "
-            f"postures: [{', '.join(names)}]}}"
-        )
-    if legs:
-        for k, leg in enumerate("xyz"):
-            for name, value in (("max", 60), ("min", -100)):
-                point = [value if k == i else 0 for i in range(3)]
-                postures.append(f"  {leg}_{name}: {{tcp_mm: {point}}}")
-            setups += [LEGS.format(leg=leg, d=d) for d in "xyz" if d != leg]
-    gauges = (
-        "gauges:\n  bar: {sigma_mm: 0.002, range_mm: [-5, 5]}\n"
-        "  dial: {sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5]}\n"
-    )
-    if not legs:
-        gauges = gauges.rsplit("  dial", 1)[0]
-    text = (
-        "robot: orthoglide\ncontroller: {offsets_mm: [0, 0, 0]}\n"
-        f"{gauges}postures:\n{chr(10).join(postures)}\nsetups:\n{chr(10).join(setups)}\n"
-    )
-    folder.mkdir(exist_ok=True)
-    (folder / "plan.yaml").write_text(text)
-    return load_plan(folder / "plan.yaml")
 
 
 def test_readings_are_distances_between_the_balls(tmp_path):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_ball_bar import circles
+from ball_bar_plans import circles
 from test_tool_indicator import AXES, STEPS, Plan
 
 from orthocal import draw_errors, simulate_session

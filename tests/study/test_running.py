@@ -32,7 +32,7 @@ from orthocal.study.runner import JOURNAL, open_results, run_study, to_parquet
 from orthocal.study.study import prepare_once, round_cell, run_task
 
 KILLS = 3
-DRAWS = 30
+DRAWS = 15
 """Draws of each task."""
 FORK = multiprocessing.get_context("fork")
 
