@@ -21,10 +21,8 @@ from orthocal import (
     Choice,
     draw_errors,
     load_plan,
-    load_robot,
     load_session,
     simulate_session,
-    write_session,
 )
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -204,14 +202,3 @@ def test_tool_errors_and_intervals_of_printers_with_all_errors(tmp_path, printer
     outcome = calibrate_machines(plan, space, count=45)
     assert_promises(outcome)
     assert outcome.bound == pytest.approx(outcome.predicted, rel=0.05)
-
-
-def test_a_session_comes_back_from_its_files(tmp_path, printer):
-    surface = "{flat_tolerance_mm: 0.2}"
-    plan = load_plan(bed(tmp_path / "a", printer, rings()[:9], surface=surface))
-    session = simulate_session(plan, {"radius": 1e-3}, seed=3).session
-    write_session(session, tmp_path / "b")
-    again = load_session(tmp_path / "b")
-    assert again.setups["bed"].sensor == session.setups["bed"].sensor
-    assert again.setups["bed"].zero == "known"
-    assert load_robot(printer).name == again.robot.name

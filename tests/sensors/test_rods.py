@@ -5,25 +5,20 @@ from __future__ import annotations
 import machines
 import numpy as np
 import pytest
-from calibrated import SOUND, identified
 
 from orthocal import (
     LegIndicator,
     Section,
     Tip,
-    calibrate,
     draw_scene,
-    load_calibration,
     load_plan,
     load_robot,
     load_session,
     simulate_session,
-    write_calibration,
     write_session,
 )
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
-from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import ObservationModel, predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
@@ -113,23 +108,6 @@ def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
         assert (centre - root) @ d > 0  # on the rod's side from which the plunger comes
 
 
-def test_offsets_are_identified_from_rods(tmp_path):
-    session = simulate_session(plan(tmp_path, "ball"), TRUTH, seed=1).session
-    found = identified(session)
-    for name, value in TRUTH.items():
-        assert abs(found[name].value - value) < 4.0 * found[name].std
-    assert [s.sensor.to_keys() for s in found.setups.__iter__()] == [
-        s.sensor.to_keys() for s in session.setups.values()
-    ]
-
-
-def test_contacts_lie_on_the_rods_surface(tmp_path):
-    session = plan(tmp_path, "ball")
-    for setup, (_, contact) in locate_contacts(session).items():
-        assert contact.problems == [""] * len(contact.points)
-        assert len(contact.points) == 0 or np.isfinite(contact.points).all(), setup
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -211,10 +189,8 @@ def test_it_is_written_and_read(tmp_path):
     again = load_session(write_session(session, tmp_path / "out"))
     for name, setup in session.setups.items():
         assert again.setups[name].sensor == setup.sensor
-    made = calibrate(again, solver="variable-projection", judgement=SOUND)
-    loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
-    assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups]
-    assert {s.sensor.describe().rpartition(", ")[2] for s in loaded.setups} == {"blade on rod a"}
+    described = {s.sensor.describe().rpartition(", ")[2] for s in again.setups.values()}
+    assert described == {"blade on rod a"}
 
 
 def test_descriptions_state_lengths_to_a_micrometre_and_directions_to_three_digits():

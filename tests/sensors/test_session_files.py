@@ -1,0 +1,67 @@
+"""Sensors at the tool in files: sessions come back, wrong keys are refused by name."""
+
+from __future__ import annotations
+
+import pytest
+from ball_bar_plans import circles
+from test_points import grid
+from test_tool_indicator import complete_plan
+
+from orthocal import load_plan, load_session, simulate_session, write_session
+from orthocal.errors import SessionError
+
+PROBE = """robot: linear_delta
+gauge: {sigma_mm: 0.01, range_mm: [-30, 30]}
+postures: {a: {tcp_mm: [0, 0, 0]}, b: {tcp_mm: [60, 0, 0]}, c: {tcp_mm: [0, 60, 0]}}
+setups: {bed: {sensor: probe, surface: {flat_tolerance_mm: 0.2}, tool_mm: [0, 0, -20]}}
+"""
+
+
+def bar(folder):
+    return circles(folder, length="0.5", keys=", scale_tolerance: 0.001", tool=(0, 0, -40))
+
+
+def probe(folder):
+    (folder / "plan.yaml").write_text(PROBE)
+    return load_plan(folder / "plan.yaml")
+
+
+@pytest.mark.parametrize("make", [bar, complete_plan, probe])
+def test_a_simulated_session_comes_back_from_its_files(tmp_path, make):
+    plan = make(tmp_path)
+    errors = {f"{plan.robot.drives[0].name}.offset": 0.7e-3}
+    session = simulate_session(plan, errors, seed=3).session
+    again = load_session(write_session(session, tmp_path / "session"))
+    for name, setup in session.setups.items():
+        assert (again.setups[name].sensor, again.setups[name].zero) == (setup.sensor, setup.zero)
+
+
+@pytest.mark.parametrize(
+    ("make", "old", "new", "place"),
+    [
+        (bar, "centre_mm: [0, 0, -40],", "centre_mm: [0, 0, 0, 1],", "centre_mm"),
+        (bar, "length_mm: 50.0, ", "", "length_mm"),
+        (bar, "length_tolerance_mm: 0.5", "length_tolerance_mm: about", "length_tolerance_mm"),
+        (bar, "centre_mm: [0, 0, -40],", "centre_mm: [0, 0, 9],", "setups.yz"),
+        (complete_plan, "direction: y", "direction: w", "direction"),
+        (complete_plan, "along: x", "along: y", "artefact.along"),
+        (complete_plan, "kind: square", "kind: circle", "artefact"),
+        (complete_plan, "height_mm: 50", "height_mm: 0.05", "height_mm"),
+        (grid, "target_mm: [3.0, -4.0, -40.0]", "target_mm: [3.0]", "target_mm"),
+        (grid, "sensor: points", "sensor: points, frame: known", "frame"),
+        (
+            grid,
+            "sensor: points",
+            "sensor: points, covariance_um2: [[1,0,0],[0,1,0],[0,0,-1]]",
+            "covariance_um2",
+        ),
+        (grid, "track:", "tr[a]ck:", "tr[a]ck"),
+    ],
+)
+def test_a_wrong_key_is_refused_by_name(tmp_path, make, old, new, place):
+    make(tmp_path)
+    file = tmp_path / "plan.yaml"
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(SessionError) as caught:
+        load_plan(file)
+    assert place in str(caught.value.where)
