@@ -267,12 +267,6 @@ def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
     assert np.array_equal(choose_box(orthoglide, beside), beside)
 
 
-def test_a_plan_uses_the_available_hours(orthoglide):
-    with uncompared(), few_machines():
-        plan = plan_readings(orthoglide, "full", hours=1.0, starts=1, equipment=Equipment(**FEW))
-    assert 45.0 < plan.minutes <= 60.0
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -250,7 +250,7 @@ def halve(expected):
 @pytest.fixture(scope="module")
 def searches(orthoglide, headline):
     """A search for each criterion, and the information of its plan."""
-    equipment = Equipment(along=5, across=0.03, sections=(0.4, 0.6))
+    equipment = Equipment(along=5, across=0.0, sections=(0.4, 0.6))
     session, forecast = list_candidates(orthoglide, equipment), headline.forecast
     candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
     n = len(candidates.state)

@@ -124,15 +124,13 @@ def test_candidates_begin_their_approach_within_the_travel(machine):
     assert within.robot is machine
 
 
-@pytest.mark.parametrize("effects", [[], ["backlash"]])
-def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
+def test_programs_of_a_plan_are_within_the_soft_limits(machine):
     """The travel is 120 to 390 mm, and 310 mm in the mechanical zero."""
-    robot = with_effects(orthoglide, effects)
     joints, axes = ((0.262, 0.353),) * 3, ((-0.035, 0.045), (-0.05, 0.03), (-np.inf, 0.04))
     with uncompared():
         free, limited = (
-            plan_readings(robot, "offsets", setups=2, equipment=equipment, starts=1).session
-            for equipment in (FEW, FEW.within_limits(robot, joints, axes))
+            plan_readings(machine, "offsets", setups=2, equipment=equipment, starts=1).session
+            for equipment in (FEW, FEW.within_limits(machine, joints, axes))
         )
     beyond = describe_beyond_limits(free, joints, axes, file="machine.ini")
     assert re.search(r"(?m)^  AXIS_[XYZ], MAX_LIMIT", beyond)
@@ -148,7 +146,7 @@ def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
     assert reached
     assert all(np.abs(words - v).min() < 6e-4 for v in reached)  # rounded to 1 µm
     with pytest.raises(ParameterError, match=r"\[AXIS_Y\] leave no room"):
-        FEW.within_limits(robot, joints, (axes[0], (0.2, 0.3), axes[2]))
+        FEW.within_limits(machine, joints, (axes[0], (0.2, 0.3), axes[2]))
 
 
 def test_positions_lie_at_fractions_of_the_lead(orthoglide):
