@@ -14,7 +14,7 @@ import pytest
 from adjusting import shimmed_plan
 from calibrated import identified
 from models import JOINTS
-from planned import FEW, QUICK, assert_machines_have_the_expected_error
+from planned import FEW, QUICK, assert_machines_have_the_expected_error, candidates_of, search_among
 from uncompared import few_machines, uncompared
 
 from orthocal import (
@@ -37,14 +37,14 @@ from orthocal.measurement.joining import join_sessions
 from orthocal.output.report.study_plots import plot_plan
 from orthocal.output.text.plan import draw_plan, plan_json
 from orthocal.planning import plan as planning
-from orthocal.planning.candidates import list_candidates, measure_candidates, share_columns
+from orthocal.planning.candidates import list_candidates, share_columns
 from orthocal.planning.cost_curve import compute_curve, find_enough
 from orthocal.planning.equipment import Equipment, choose_box
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import Duration
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.ranking import is_less
-from orthocal.planning.selection import PlannedSetup, SetupSearch
+from orthocal.planning.selection import PlannedSetup
 from orthocal.planning.timed_search import TimedSearch
 from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
@@ -63,8 +63,7 @@ def planned(orthoglide):
 
 
 @pytest.mark.parametrize(
-    ("tip", "setups", "each", "most"),
-    [(BALL, 6, 3, 11.4), (None, 6, 16, 9.0)],
+    ("tip", "setups", "each", "most"), [(BALL, 6, 3, 11.4), (None, 6, 16, 9.0)]
 )
 def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     """Best manual plans for 126 errors, a dial of ±5 mm and 5 µm with mounting errors, [µm].
@@ -80,19 +79,16 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     forecast = ToolForecast(
         orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
     )
-    session = list_candidates(orthoglide, equipment)
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
-    n = len(candidates.state)
-    search = SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
-    plan = search.choose([each] * setups, starts=1)
+    plan = search_among(candidates_of(forecast, equipment), forecast).choose(
+        [each] * setups, starts=1
+    )
     assert round(plan.error * 1e6, 1) <= most
 
 
 def test_the_error_of_the_search_is_the_posterior_of_the_session(planned):
     """Low-rank algebra over setups gives the error of one problem with all readings."""
     once = replace(
-        planned.session,
-        readings=tuple(r for r in planned.session.readings if r.cycle == 1),
+        planned.session, readings=tuple(r for r in planned.session.readings if r.cycle == 1)
     )
     forecast = planned.forecast
     without, complete = (forecast.about_nominal(s).reported.rms for s in (once, planned.session))
@@ -151,13 +147,6 @@ def test_readings_of_machines_at_tolerance_stay_in_the_gauges_range(planned):
         simulate_session(planned.session, errors, seed=seed)  # refuses readings beyond the range
 
 
-def test_a_setup_begins_and_ends_with_the_alignment_posture(planned):
-    for name in planned.session.setups:
-        rows = [r for r in planned.session.readings if r.setup == name]
-        assert (rows[0].posture, rows[0].cycle, rows[-1].cycle) == (rows[-1].posture, 1, 2)
-        assert len({r.posture for r in rows}) == len(rows) - 1
-
-
 def test_a_written_plan_is_measured_and_calibrated(planned, tmp_path):
     path = write_session(planned.session, tmp_path / "monday", blank=True)
     with pytest.raises(
@@ -188,13 +177,11 @@ def test_sections_near_the_tool_are_best_for_the_papers_six_equations(orthoglide
         across=0.0,
     )
     forecast = ToolForecast(orthoglide, Choice("offsets").select(orthoglide.parameters))
-    session = list_candidates(orthoglide, equipment)
-    # largest section at which the gauge touches the leg in all postures
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
-    n = len(candidates.state)
-    search = SetupSearch.of(candidates, 1e-8 * np.eye(n), forecast.weight_of("A", n))
-    found = search.choose([2] * 6, starts=4)
-    chosen = [session.setups[candidates.setups[s.candidate].name].sensor for s in found.setups]
+    candidates = candidates_of(forecast, equipment)
+    found = search_among(candidates, forecast, criterion="A", prior=1e-8).choose([2] * 6, starts=4)
+    setups = candidates.session.setups
+    chosen = [setups[candidates.setups[s.candidate].name].sensor for s in found.setups]
+    # the largest section at which the gauge touches the leg in all postures
     assert {s.section.value for s in chosen} == {0.8}
     # all six, or three of them twice, one for each leg, which have equal information
     assert sorted(s.leg for s in chosen) == list("xxyyzz")
@@ -308,10 +295,7 @@ def test_the_default_workspace_keeps_clear_of_the_end_of_the_reach(tmp_path, leg
 
 def make_search(robot, equipment):
     forecast = ToolForecast(robot, Choice("full").select(robot.parameters))
-    session = list_candidates(robot, equipment)
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
-    n = len(candidates.state)
-    return SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
+    return search_among(candidates_of(forecast, equipment, spare_range=3.0), forecast)
 
 
 def test_the_memory_of_a_plan_is_released_with_it(orthoglide):

@@ -12,25 +12,15 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from commands import run_orthocal
-from planned import FEW
+from planned import FEW, candidates_of, search_among
 from processes import children_of, is_running, until
 from uncompared import uncompared
 
-from orthocal import (
-    MeasuringPlan,
-    load_plan,
-    load_session,
-    plan_readings,
-    summarize,
-    write_session,
-)
-from orthocal.planning.candidates import list_candidates, measure_candidates
+from orthocal import MeasuringPlan, load_plan, load_session, plan_readings, summarize, write_session
 from orthocal.planning.equipment import USUAL_BALL, Equipment
 from orthocal.planning.expected_error import CRITERIA
-from orthocal.planning.selection import SetupSearch
 from orthocal.runtime import worker_pool
 from orthocal.runtime.interrupts import INTERRUPTED
 from orthocal.session.session import Purpose
@@ -248,15 +238,13 @@ def halve(expected):
 
 
 @pytest.fixture(scope="module")
-def searches(orthoglide, headline):
+def searches(headline):
     """A search for each criterion, and the information of its plan."""
     equipment = Equipment(along=5, across=0.0, sections=(0.4, 0.6))
-    session, forecast = list_candidates(orthoglide, equipment), headline.forecast
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
-    n = len(candidates.state)
-    found = {}
+    forecast, found = headline.forecast, {}
+    candidates = candidates_of(forecast, equipment, spare_range=3.0)
     for criterion in CRITERIA:
-        search = SetupSearch.of(candidates, np.eye(n), forecast.weight_of(criterion, n))
+        search = search_among(candidates, forecast, criterion=criterion)
         found[criterion] = search, search.choose([3, 3, 3], starts=1).information
     return found
 

@@ -12,11 +12,7 @@ from commands import run_orthocal
 from planned import calibrate_drawn
 from uncompared import uncompared
 
-from orthocal import (
-    load_plan,
-    simulate_session,
-    write_session,
-)
+from orthocal import load_plan, simulate_session, write_session
 from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError

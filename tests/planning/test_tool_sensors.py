@@ -18,6 +18,7 @@ from planned import (
     FEW,
     QUICK,
     assert_machines_have_the_expected_error,
+    candidates_of,
     entered,
     quick_plan,
 )
@@ -389,10 +390,9 @@ def planned_bar(owned):
     """Candidates and a planned setup of a ball bar with twelve postures."""
     robot = replace(with_effects(load_robot("linear_delta"), ["backlash"]), legs={})
     equipment = Equipment(owned=owned(bar=BAR.replace("length_mm: 50", "length_mm: 60")))
-    with few_balls(1):
-        session = list_candidates(robot, equipment)
     forecast = ToolForecast(robot, resolve_choice("offsets", None).select(robot.parameters))
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
+    with few_balls(1):
+        candidates = candidates_of(forecast, equipment)
     count = len(candidates.setups[0].rows)
     planned = [PlannedSetup(0, tuple(np.random.default_rng(0).permutation(count)[:12].tolist()))]
     return candidates, planned
@@ -623,23 +623,19 @@ def test_a_plan_of_points_is_one_setup_within_its_time(tracked):
 
 def search_plan(robot, sensors, counts, measured=None):
     """Plan without closing readings, the error of its search, and the forecast of lengths alone."""
-    session = list_candidates(robot, Equipment(owned=sensors))
     selection = resolve_choice("lengths", None).select(robot.parameters)
     forecast = ToolForecast(robot, selection, others={})
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
-    search = SetupSearch.of(
-        candidates,
-        forecast.prior_information(candidates.problem, candidates.state, measured),
-        forecast.weight_of("aligned", len(candidates.state)),
-    )
-    planned = search.choose(counts, starts=1)
+    candidates = candidates_of(forecast, Equipment(owned=sensors))
+    prior = forecast.prior_information(candidates.problem, candidates.state, measured)
+    weight = forecast.weight_of("aligned", len(candidates.state))
+    planned = SetupSearch.of(candidates, prior, weight).choose(counts, starts=1)
     plan = build_session(candidates, planned.setups, measured)
     once = replace(plan, readings=tuple(r for r in plan.readings if r.cycle == 1))
     return once, planned.error, forecast
 
 
 @pytest.mark.parametrize("keys", ["", "frame: {tolerance_mm: 1, tolerance_mrad: 2}\n", CORRELATED])
-def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
+def test_the_candidates_of_points_agrees_with_the_forecast(owned, keys):
     plan, error, forecast = search_plan(without_legs(), owned(track=TRACKER + keys), [7])
     assert len(plan.readings) == 21
     assert error == pytest.approx(forecast.about_nominal(plan).reported.rms, rel=1e-6)

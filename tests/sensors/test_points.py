@@ -170,11 +170,7 @@ def tracked(folder):
 
 @pytest.mark.parametrize(
     ("point", "axis", "factor", "kind"),
-    [
-        (13, 0, -1.0, "reversed sign"),
-        (20, 1, 0.1, "decimal point"),
-        (5, 0, 1.03, "outlier"),
-    ],
+    [(13, 0, -1.0, "reversed sign"), (20, 1, 0.1, "decimal point"), (5, 0, 1.03, "outlier")],
 )
 def test_check_names_a_mistyped_point_alone(tmp_path, point, axis, factor, kind):
     session, points = tracked(tmp_path)

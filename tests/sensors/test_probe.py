@@ -17,13 +17,7 @@ from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import (
-    Choice,
-    draw_errors,
-    load_plan,
-    load_session,
-    simulate_session,
-)
+from orthocal import Choice, draw_errors, load_plan, load_session, simulate_session
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube

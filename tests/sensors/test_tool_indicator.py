@@ -14,11 +14,7 @@ from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import (
-    load_plan,
-    load_robot,
-    simulate_session,
-)
+from orthocal import load_plan, load_robot, simulate_session
 from orthocal.kinematics.workspace import cube
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters

@@ -131,11 +131,9 @@ def test_model_std_includes_the_prior(root):
     assert all(p.predicted < p.model_std for p in found.parameters)
 
 
-def test_session_without_residuals_or_cycles(root):
+def test_session_without_residuals(root):
     with pytest.raises(SessionError, match="has no residuals to resample"):
         build_bootstrap_study(load_session(root / "examples/workshop"), "full")
-    with pytest.raises(SessionError, match=r"setups\.\w+: has one cycle of readings"):
-        build_bootstrap_study(load_session(root / "examples/workshop"), "offsets", by="cycles")
 
 
 def test_cycles_with_different_postures(raw_cycles):

@@ -11,7 +11,7 @@ from machines import place
 
 from orthocal import load_plan
 from orthocal.effects.compensation import JointTrim
-from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.session.session import Gauge
 from orthocal.study.runner import run_study
@@ -152,8 +152,3 @@ def test_unreachable_points(orthoglide):
         build_sensitivity_study(orthoglide, points=[[0.5, 0.0, 0.0]])
     with pytest.raises(ClosureError, match="x_max"):
         build_sensitivity_study(orthoglide, displacements=Displacements(0.5, -0.1))
-
-
-def test_unknown_names(orthoglide):
-    with pytest.raises(ParameterError, match="nothing"):
-        build_sensitivity_study(orthoglide, ["nothing"])

@@ -117,10 +117,7 @@ def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root):
             ["accuracy", "examples/workshop", "--dask", "tcp://127.0.0.1:1", "--workers", "2"],
             "--workers: cannot be combined with --dask",
         ),
-        (
-            ["linearisation", "orthoglide", "--along", "1,2"],
-            "--along: found 1, 2; expected 3",
-        ),
+        (["linearisation", "orthoglide", "--along", "1,2"], "--along: found 1, 2; expected 3"),
         (["linearisation", "orthoglide", "--along", "1,b,2"], "--along: part is 'b'; expected"),
         (["linearisation", "--along", "1,0,0", "--directions", 2], "--directions: cannot be"),
         (["linearisation", "--leg-mm", "-5"], "--leg-mm: legs of -5 mm; expected 20 to 5000 mm"),

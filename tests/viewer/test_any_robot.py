@@ -7,13 +7,7 @@ import pinocchio as pin
 import pytest
 from commands import run_orthocal
 from conftest import ROOT
-from linkages import (
-    joint,
-    write_ball_platform,
-    write_crooked_loop,
-    write_robot,
-    write_wide_linkage,
-)
+from linkages import joint, write_ball_platform, write_crooked_loop, write_robot, write_wide_linkage
 from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
