@@ -14,7 +14,8 @@ import pytest
 from adjusting import shimmed_plan
 from calibrated import identified
 from models import JOINTS
-from planned import FEW, QUICK, assert_machines_have_the_expected_error, candidates_of, search_among
+from plan_searches import assert_machines_have_the_expected_error, candidates_of, search_among
+from planned import FEW, QUICK
 from uncompared import few_machines, uncompared
 
 from orthocal import (
@@ -79,9 +80,8 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     forecast = ToolForecast(
         orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
     )
-    plan = search_among(candidates_of(forecast, equipment), forecast).choose(
-        [each] * setups, starts=1
-    )
+    search = search_among(candidates_of(forecast, equipment), forecast)
+    plan = search.choose([each] * setups, starts=1)
     assert round(plan.error * 1e6, 1) <= most
 
 

@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import pytest
 from commands import run_orthocal
-from planned import FEW, candidates_of, search_among
+from plan_searches import candidates_of, search_among
+from planned import FEW
 from processes import children_of, is_running, until
 from uncompared import uncompared
 

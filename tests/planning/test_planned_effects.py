@@ -9,7 +9,7 @@ from datetime import timedelta
 import numpy as np
 import pytest
 from commands import run_orthocal
-from planned import calibrate_drawn
+from plan_searches import calibrate_drawn
 from uncompared import uncompared
 
 from orthocal import load_plan, simulate_session, write_session

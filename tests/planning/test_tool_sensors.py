@@ -14,14 +14,8 @@ from ball_bar_plans import circles
 from calibrated import identified
 from commands import run_orthocal
 from machines import frame_pose, frames
-from planned import (
-    FEW,
-    QUICK,
-    assert_machines_have_the_expected_error,
-    candidates_of,
-    entered,
-    quick_plan,
-)
+from plan_searches import assert_machines_have_the_expected_error, candidates_of
+from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
 from uncompared import few_balls, few_machines, uncompared
 
