@@ -25,7 +25,6 @@ from orthocal import (
     plan_readings,
     simulate_session,
     summarize,
-    write_session,
 )
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.loading import with_effects
@@ -727,24 +726,6 @@ def test_a_plan_of_points_is_measured_and_calibrated(tmp_path):
     simulated = [str(tmp_path / "plan"), "--out", measured, "--draw", "*", "--seed", "1"]
     assert run_orthocal(".", "simulate", *simulated)[0] == 0
     assert run_orthocal(".", "calibrate", measured, "--json")[0] == 0
-
-
-def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
-    """Each principal axis of a covariance has a gauge in the session; the file has one gauge."""
-    session = list_candidates(
-        entered("orthoglide"), Equipment(owned=owned(track=TRACKER + CORRELATED), **QUICK)
-    )
-    dial = next(r for r in session.readings if r.setup == "yx@a_0.5")
-    of_point = [r for r in session.readings if r.setup.startswith("track")][:12]
-    few = replace(session, robot_reference="orthoglide").select([dial, *of_point])
-    write_session(few, tmp_path / "few", blank=True)
-    again = load_plan(tmp_path / "few")
-    assert [(r.setup, r.posture) for r in again.readings] == [
-        (r.setup, r.posture) for r in few.readings
-    ]
-    assert {n: again.gauges[s.gauge].sigma for n, s in again.setups.items()} == pytest.approx(
-        {n: few.gauges[s.gauge].sigma for n, s in few.setups.items()}
-    )
 
 
 @pytest.fixture(scope="module")

@@ -134,22 +134,6 @@ def test_nuisance_parameters_are_identified_with_the_machine(plan):
     assert [p.name for p in result.free] == list(TRUTH)
 
 
-def simulated_fits(plan, count, others=()):
-    """Truth by name, and fit, of simulated sessions; errors named `others` are drawn."""
-    planned = build_problem(plan, model="offsets")
-    for seed in range(count):
-        errors = {**(draw_errors(plan.robot, others, seed=seed) if others else {}), **TRUTH}
-        simulated = simulate_session(plan, errors, seed=seed)
-        problem = planned.with_values(simulated.session.values)
-        yield {**TRUTH, **simulated.nuisance}, fit_problem(problem, options=FAST)
-
-
-def assert_unit_variance(scores):
-    """Compare the squares of independent standard normal scores with the 99 % band of χ²."""
-    low, high = chi2.interval(0.99, np.size(scores))
-    assert low < np.square(scores).sum() < high
-
-
 def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     """12 machines: offsets and slopes against standard deviations with unmodelled errors.
 
@@ -157,7 +141,12 @@ def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     """
     others = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     of_offsets, of_slopes = [], []
-    for truth, fit in simulated_fits(plan, 12, others):
+    planned = build_problem(plan, model="offsets")
+    for seed in range(12):
+        errors = {**draw_errors(plan.robot, others, seed=seed), **TRUTH}
+        simulated = simulate_session(plan, errors, seed=seed)
+        truth = {**TRUTH, **simulated.nuisance}
+        fit = fit_problem(planned.with_values(simulated.session.values), options=FAST)
         result = build_record.assemble_calibration(fit)
         of_offsets.append(recorded_scores(result, TRUTH)[0])
         total = np.sqrt(np.diag(result.total_covariance))
@@ -166,7 +155,8 @@ def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     estimates = (*result.free, *result.sensors)
     assert [p.name for p in estimates] == list(fit.problem.free)
     assert [p.value for p in estimates] == fit.solution.theta.tolist()
-    assert_unit_variance(of_offsets)
+    low, high = chi2.interval(0.99, np.size(of_offsets))
+    assert low < np.square(of_offsets).sum() < high
     # the noise of the slopes is that of the residuals, which contain the other errors
     count = np.size(of_slopes)
     assert np.square(of_slopes).sum() < chi2.ppf(0.995, count)

@@ -7,7 +7,7 @@ from ball_bar_plans import circles
 from test_points import grid
 from test_tool_indicator import complete_plan
 
-from orthocal import load_plan, load_session, simulate_session, write_session
+from orthocal import load_plan, simulate_session, write_session
 from orthocal.errors import SessionError
 
 PROBE = """robot: linear_delta
@@ -17,23 +17,40 @@ setups: {bed: {sensor: probe, surface: {flat_tolerance_mm: 0.2}, tool_mm: [0, 0,
 """
 
 
+MIXED = """robot: orthoglide
+gauges: {dial: {sigma_mm: 0.01}, tracker: {sigma_mm: 0.02}}
+postures: {zero: {tcp_mm: [0, 0, 0]}, a: {tcp_mm: [60, 0, 0]}, b: {tcp_mm: [0, 60, 0]}}
+setups:
+  yx: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial, postures: [zero, a]}
+  track: {sensor: points, covariance_um2: [[90, 40, 0], [40, 60, 0], [0, 0, 400]], gauge: tracker}
+"""
+
+
 def bar(folder):
     return circles(folder, length="0.5", keys=", scale_tolerance: 0.001", tool=(0, 0, -40))
 
 
-def probe(folder):
-    (folder / "plan.yaml").write_text(PROBE)
-    return load_plan(folder / "plan.yaml")
+def of_text(text):
+    def make(folder):
+        (folder / "plan.yaml").write_text(text)
+        return load_plan(folder / "plan.yaml")
+
+    return make
 
 
-@pytest.mark.parametrize("make", [bar, complete_plan, probe])
+@pytest.mark.parametrize("make", [bar, complete_plan, of_text(PROBE), of_text(MIXED)])
 def test_a_simulated_session_comes_back_from_its_files(tmp_path, make):
+    """Each principal axis of a covariance has a gauge in the session, the file has one of all."""
     plan = make(tmp_path)
     errors = {f"{plan.robot.drives[0].name}.offset": 0.7e-3}
     session = simulate_session(plan, errors, seed=3).session
-    again = load_session(write_session(session, tmp_path / "session"))
+    again = load_plan(write_session(session, tmp_path / "session"))
     for name, setup in session.setups.items():
-        assert (again.setups[name].sensor, again.setups[name].zero) == (setup.sensor, setup.zero)
+        read = again.setups[name]
+        assert (read.sensor, read.zero) == (setup.sensor, setup.zero)
+        sigma = session.gauges[setup.gauge].sigma
+        assert again.gauges[read.gauge].sigma == pytest.approx(sigma)
+    assert [r.key for r in again.readings] == [r.key for r in session.readings]
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_gauges_have_their_own_noise(many_cycles, order):
     gauges = {name: Gauge({"coarse": 20e-6, "fine": 2e-6}[name]) for name in order}
     plan = with_gauges(plan, gauges, set(list(plan.setups)[:3]))
     session = simulate_session(plan, {"x_slide.offset": 0.5e-3}, seed=1).session
-    study = build_bootstrap_study(session, "offsets", draws=400)
+    study = build_bootstrap_study(session, "offsets", draws=200)
     for p in summarise_bootstrap(study, run_study(study)).parameters:
         assert p.low < p.estimate < p.high
         assert p.std / p.predicted == pytest.approx(1.0, abs=0.3)
@@ -115,18 +115,9 @@ def test_draws_consist_of_complete_cycles(raw_cycles):
         assert {tuple(drawn[c]) for c in cycles} <= known
 
 
-def test_rescaled_residuals_have_the_size_of_the_noise(many_cycles):
-    prepared = build_bootstrap_study(many_cycles, "offsets", draws=2).prepare()
-    sigma = many_cycles.gauge.sigma
-    resolution = many_cycles.gauge.resolution or 0.0
-    expected = np.hypot(sigma, resolution / np.sqrt(12))
-    assert prepared.residuals.std() == pytest.approx(expected, rel=0.08)
-    assert abs(prepared.residuals.mean()) < 1e-18
-
-
 def test_model_std_includes_the_prior(root):
     session = load_session(root / "examples/sweep")
-    study = build_bootstrap_study(session, "lengths", draws=60)
+    study = build_bootstrap_study(session, "lengths", draws=2)
     found = summarise_bootstrap(study, run_study(study))
     assert all(p.predicted < p.model_std for p in found.parameters)
 
