@@ -13,9 +13,6 @@ from orthocal import (
     draw_scene,
     load_plan,
     load_robot,
-    load_session,
-    simulate_session,
-    write_session,
 )
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
@@ -184,21 +181,14 @@ def test_a_gauges_tip_is_that_of_its_setups(tmp_path):
     assert all(keys["tip"] == {"blade": {"width_mm": 12.0}} for keys in rods)
 
 
-def test_it_is_written_and_read(tmp_path):
-    session = simulate_session(plan(tmp_path, "pin"), TRUTH, seed=1).session
-    again = load_session(write_session(session, tmp_path / "out"))
-    for name, setup in session.setups.items():
-        assert again.setups[name].sensor == setup.sensor
-    described = {s.sensor.describe().rpartition(", ")[2] for s in again.setups.values()}
-    assert described == {"blade on rod a"}
-
-
 def test_descriptions_state_lengths_to_a_micrometre_and_directions_to_three_digits():
     section = Section("coordinate_mm", -0.1031234567)
     line = LegIndicator("x", (0.0, np.sqrt(0.75), 0.5), section)
     assert line.describe() == "leg x, gauge in (0, 0.866, 0.5), at coordinate -103.123 mm"
     for direction, name in (((0.0, -2.0, 0.0), "-y"), ((0.6, 0.8, -0.0), "(0.6, 0.8, 0)")):
         assert f"gauge in {name}, at" in LegIndicator("x", direction, section).describe()
+    blade = line.on_rod("b", Tip("blade", 0.0, 0.02))
+    assert blade.describe().endswith(", blade on rod b")
     ball = line.on_rod("a", Tip("ball", 0.0015), (0.0, -0.0001234567, 2e-7))
     assert ball.describe().endswith(", off its centre line by 0.123 mm towards −y")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from ball_bar_plans import circles
 from test_points import grid
+from test_rods import plan as rods_plan
 from test_tool_indicator import complete_plan
 
 from orthocal import load_plan, write_session
@@ -30,6 +31,10 @@ def bar(folder):
     return circles(folder, length="0.5", keys=", scale_tolerance: 0.001", tool=(0, 0, -40))
 
 
+def rods(folder):
+    return rods_plan(folder, "pin")
+
+
 def of_text(text):
     def make(folder):
         (folder / "plan.yaml").write_text(text)
@@ -38,7 +43,7 @@ def of_text(text):
     return make
 
 
-@pytest.mark.parametrize("make", [bar, complete_plan, of_text(PROBE), of_text(MIXED)])
+@pytest.mark.parametrize("make", [bar, complete_plan, rods, of_text(PROBE), of_text(MIXED)])
 def test_a_plan_comes_back_from_its_files(tmp_path, make):
     """Each principal axis of a covariance has a gauge in the session, the file has one of all."""
     plan = make(tmp_path)

@@ -141,12 +141,10 @@ def turned_over(tmp_path_factory):
     return simulate_session(plan, errors_of(plan, 0), seed=0).session
 
 
-def test_a_square_that_was_turned_over_as_stated_is_not_accused(turned_over):
-    assert warnings_of(turned_over) == []
-
-
 @pytest.mark.parametrize("wrong", [("over_x", "over_y"), ("over_y",)], ids="-".join)
 def test_a_square_that_was_turned_over_unstated_is_named(turned_over, wrong):
+    if len(wrong) == 2:
+        assert warnings_of(turned_over) == []
     found = warnings_of(with_artefact(turned_over, wrong, reversed=False))
     assert len(found) == 1
     assert found[0].kind == ("displaced artefact" if len(wrong) == 2 else "ambiguous")

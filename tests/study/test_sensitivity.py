@@ -130,16 +130,6 @@ def test_derivatives_agree_with_central_differences(orthoglide):
         assert found.per_prior_std[along_x, i] == pytest.approx(expected_um, abs=1e-10)
 
 
-def test_all_readings_of_a_session(root):
-    plan = load_plan(root / "examples/workshop/plan.yaml")
-    study = build_sensitivity_study(plan)
-    table = run_study(study)
-    found = summarise_sensitivity(study, table)
-    assert len(found.parameters) == 129
-    assert sum(reads in plan.setups for _, reads in found.rows) == 18
-    assert len(table) == len(found.rows) * 129
-
-
 def test_points_without_contact(root):
     """The ball of a gauge is at a fixed place on the base."""
     plan = load_plan(root / "examples/workshop/plan.yaml")
