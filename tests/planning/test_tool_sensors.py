@@ -637,7 +637,7 @@ def test_the_candidates_of_points_agrees_with_the_forecast(owned, keys):
 @pytest.mark.parametrize(
     "keys",
     [
-        "length_mm: 50\nlength_tolerance_mm: unknown\n",
+        "length_mm: 60\nlength_tolerance_mm: 0.01\n",
         "length_mm: 50\nlength_tolerance_mm: 0\nscale_tolerance: 0.1\n",
     ],
 )

@@ -223,10 +223,12 @@ def test_each_session_has_its_own_offsets(root):
         target = drives + measured.active.get(name, measured.offsets)
         expected = first.postures[name.rpartition("/")[2]].drives
         assert target == pytest.approx(expected, abs=1e-12)
-    scene = draw_scene(joined, posture="raw-cycles-2/x_max")
     robot, drives = first.robot, first.postures["x_max"].drives
     target = placed(robot, drives, robot.close_with_pinocchio(drives, robot.reference_passive))
-    assert np.abs(world(scene, f"{drawing.GHOST}/platform") - target["platform"]).max() < 1e-11
+    shown = [(joined, f"raw-cycles-{day}/x_max") for day in (1, 2)]
+    for subject, posture in (*shown, (identified(second), "x_max")):
+        ghost = world(draw_scene(subject, posture=posture), f"{drawing.GHOST}/platform")
+        assert np.abs(ghost - target["platform"]).max() < 1e-11
 
 
 def test_readings_of_several_approaches_are_not_averaged():
