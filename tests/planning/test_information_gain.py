@@ -12,6 +12,7 @@ from orthocal.planning.candidates import AlignedParameter, CandidateSetup
 from orthocal.planning.information_gain import Pairs, PointGain, SetupGain, stack_setups
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
+POINTS, WIDTH = 6, 3
 
 
 def draw(seed):
@@ -28,18 +29,29 @@ def draw(seed):
     return setup, *draw_others(rng)
 
 
+def draw_points(seed):
+    """Candidate setup of points, each of three numbers; information and root as in `draw`."""
+    rng = np.random.default_rng(seed)
+    rows = POINTS * WIDTH
+    jacobian, of_nuisance = rng.normal(size=(rows, STATE)), rng.normal(size=(rows, 2))
+    covariance, reachable = of_nuisance @ of_nuisance.T, np.ones((POINTS, POINTS), dtype=bool)
+    first = np.arange(0, rows, WIDTH)
+    setup = CandidateSetup("k", first, jacobian, covariance, reachable, width=WIDTH)
+    return setup, *draw_others(rng)
+
+
 def draw_others(rng):
     """Information of other setups about the state, and root of the weight."""
     rows = rng.normal(size=(STATE, STATE))
     return rows @ rows.T + np.eye(STATE), rng.normal(size=(STATE, 2))
 
 
-def weighted_trace(setup, information, root, rows):
-    """tr(T C) with some readings, by the inverse of the total information.
+def weighted_trace(setup, information, root, chosen):
+    """tr(T C) with some readings or points, by the inverse of the total information.
 
     A free gauge zero is one more parameter without a prior.
     """
-    rows = list(rows)
+    rows = [setup.width * i + c for i in chosen for c in range(setup.width)]
     covariance = setup.covariance[np.ix_(rows, rows)] + SIGMA**2 * np.eye(len(rows))
     free = int(not setup.absolute and setup.width == 1 and len(rows) > 0)
     jacobian = np.hstack([setup.jacobian[rows], np.ones((len(rows), free))])
@@ -53,36 +65,50 @@ def gain_of(kind, setup, information, root):
     return kind.of(setup, covariance, covariance @ root, SIGMA)
 
 
+def gain_and_reduction(kind, setup, information, root):
+    """Gain of a setup, and the reduction of the error by chosen readings or points."""
+
+    def reduction(chosen, without=()):
+        before, after = (weighted_trace(setup, information, root, r) for r in (without, chosen))
+        return before - after
+
+    return gain_of(kind, setup, information, root), reduction
+
+
 @pytest.fixture(params=range(4))
 def drawn(request):
-    setup, information, root = draw(request.param)
-    gain = gain_of(SetupGain, setup, information, root)
-
-    def reduction(rows, without=()):
-        without, after = (weighted_trace(setup, information, root, r) for r in (without, rows))
-        return without - after
-
-    return gain, reduction
+    return gain_and_reduction(SetupGain, *draw(request.param))
 
 
-def test_a_gain_is_the_reduction_of_the_error(drawn):
-    gain, reduction = drawn
-    for rows in ([2], [0, 3], [1, 4, 6, 2]):
-        assert gain.gains(np.array([rows])) == pytest.approx(reduction(rows), rel=1e-9, abs=1e-12)
+@pytest.fixture(params=range(2))
+def drawn_points(request):
+    return gain_and_reduction(PointGain, *draw_points(request.param))
 
 
-def assert_exchanges(gain, reduction, chosen, count):
-    """Compare gains of readings in place of each chosen one with reductions of the error."""
+@pytest.fixture(
+    params=[(SetupGain, draw, seed) for seed in range(4)] + [(PointGain, draw_points, 0)]
+)
+def drawn_of_both(request):
+    kind, draw, seed = request.param
+    return gain_and_reduction(kind, *draw(seed))
+
+
+def test_a_gain_is_the_reduction_of_the_error(drawn_of_both):
+    gain, reduction = drawn_of_both
+    for chosen in ([2], [0, 3], [1, 4, 5, 2]):
+        expected = pytest.approx(reduction(chosen), rel=1e-9, abs=1e-12)
+        assert gain.gains(np.array([chosen])) == expected
+
+
+def test_the_gain_of_a_reading_or_point_in_place_of_another(drawn_of_both):
+    gain, reduction = drawn_of_both
+    chosen = [5, 1, 3]
     gains = gain.exchange_gains(chosen)
     for place in range(len(chosen)):
         others = chosen[:place] + chosen[place + 1 :]
-        for new in set(range(count)) - set(others):
+        for new in set(range(len(gain.setup.rows))) - set(others):
             expected = reduction([*others, new], without=others)
             assert gains[place, new] == pytest.approx(expected, rel=1e-9)
-
-
-def test_the_gain_of_a_reading_in_place_of_another(drawn):
-    assert_exchanges(*drawn, [5, 1, 3], READINGS)
 
 
 def test_the_best_pair_of_an_absolute_setup(drawn):
@@ -204,46 +230,6 @@ def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
             assert gain.gains(np.array([rows])) == pytest.approx(expected, rel=1e-10)
         jacobian = align(setup, first).jacobian[[first, second]]
         assert setup.jacobian_of([first, second]) == pytest.approx(jacobian, abs=1e-14)
-
-
-POINTS, WIDTH = 6, 3
-
-
-def draw_points(seed):
-    """Candidate setup of points, each of three numbers; information and root as in `draw`."""
-    rng = np.random.default_rng(seed)
-    rows = POINTS * WIDTH
-    jacobian, of_nuisance = rng.normal(size=(rows, STATE)), rng.normal(size=(rows, 2))
-    covariance, reachable = of_nuisance @ of_nuisance.T, np.ones((POINTS, POINTS), dtype=bool)
-    first = np.arange(0, rows, WIDTH)
-    setup = CandidateSetup("k", first, jacobian, covariance, reachable, width=WIDTH)
-    return setup, *draw_others(rng)
-
-
-@pytest.fixture(params=range(2))
-def drawn_points(request):
-    setup, information, root = draw_points(request.param)
-
-    def reduction(points, without=()):
-        before, after = (
-            weighted_trace(
-                setup, information, root, [WIDTH * i + c for i in p for c in range(WIDTH)]
-            )
-            for p in (without, points)
-        )
-        return before - after
-
-    return gain_of(PointGain, setup, information, root), reduction
-
-
-def test_the_gain_of_points_is_the_reduction_of_the_error(drawn_points):
-    gain, reduction = drawn_points
-    for points in ([2], [0, 3], [5, 1, 4, 2]):
-        assert gain.gains(np.array([points])) == pytest.approx(reduction(points), rel=1e-9)
-
-
-def test_the_gain_of_a_point_in_place_of_another(drawn_points):
-    assert_exchanges(*drawn_points, [5, 1, 3], POINTS)
 
 
 def test_points_are_completed_greedily_from_the_best_one(drawn_points):

@@ -12,9 +12,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from adjusting import shimmed_plan
-from bounds import rms_band
 from calibrated import identified
 from models import JOINTS
+from plan_searches import assert_machines_have_the_expected_error, candidates_of, search_among
 from planned import FEW, QUICK
 from uncompared import few_machines, uncompared
 
@@ -30,8 +30,6 @@ from orthocal import (
 from orthocal.builder.build import make_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ParameterError, SessionError
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import cube
@@ -40,14 +38,14 @@ from orthocal.measurement.joining import join_sessions
 from orthocal.output.report.study_plots import plot_plan
 from orthocal.output.text.plan import draw_plan, plan_json
 from orthocal.planning import plan as planning
-from orthocal.planning.candidates import list_candidates, measure_candidates, share_columns
+from orthocal.planning.candidates import list_candidates, share_columns
 from orthocal.planning.cost_curve import compute_curve, find_enough
 from orthocal.planning.equipment import Equipment, choose_box
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import Duration
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.ranking import is_less
-from orthocal.planning.selection import PlannedSetup, SetupSearch
+from orthocal.planning.selection import PlannedSetup
 from orthocal.planning.timed_search import TimedSearch
 from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
@@ -66,8 +64,7 @@ def planned(orthoglide):
 
 
 @pytest.mark.parametrize(
-    ("tip", "setups", "each", "most"),
-    [(BALL, 6, 3, 11.4), (None, 6, 16, 9.0)],
+    ("tip", "setups", "each", "most"), [(BALL, 6, 3, 11.4), (None, 6, 16, 9.0)]
 )
 def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     """Best manual plans for 126 errors, a dial of ±5 mm and 5 µm with mounting errors, [µm].
@@ -83,10 +80,7 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     forecast = ToolForecast(
         orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
     )
-    session = list_candidates(orthoglide, equipment)
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
-    n = len(candidates.state)
-    search = SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
+    search = search_among(candidates_of(forecast, equipment), forecast)
     plan = search.choose([each] * setups, starts=1)
     assert round(plan.error * 1e6, 1) <= most
 
@@ -94,8 +88,7 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
 def test_the_error_of_the_search_is_the_posterior_of_the_session(planned):
     """Low-rank algebra over setups gives the error of one problem with all readings."""
     once = replace(
-        planned.session,
-        readings=tuple(r for r in planned.session.readings if r.cycle == 1),
+        planned.session, readings=tuple(r for r in planned.session.readings if r.cycle == 1)
     )
     forecast = planned.forecast
     without, complete = (forecast.about_nominal(s).reported.rms for s in (once, planned.session))
@@ -132,42 +125,8 @@ def test_the_picture_of_a_plan_states_when_errors_are_expected_and_shows_all_pla
     assert papers.get_markersize() > 1.3 * even.get_markersize() > 1.6 * this.get_markersize()
 
 
-def assert_machines_have_the_expected_error(plan, *, machines):
-    """Compare tool errors of calibrated machines, in closed loops, with the expected error.
-
-    All errors of the machine and of the mounting are drawn; offsets are small.
-    """
-    robot, workspace = plan.session.robot, plan.forecast.workspace
-    problem = CalibrationProblem(plan.session, plan.forecast.selection)
-    rng = np.random.default_rng(0)
-    names = problem.machine_selection.names
-    n = len(names)
-    theta = rng.normal(size=(machines, problem.n_free)) * problem.theta_scale
-    for seed in range(machines):
-        drawn = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 0.4})
-        theta[seed, :n] = [drawn[name] for name in names]
-    sigma = float(np.hypot(5e-6, 10e-6 / np.sqrt(12.0)))
-    values, _, reached = problem.simulate(theta)
-    assert reached.all()
-    values = values + sigma * rng.normal(size=values.shape)
-    fitted = BatchSolver(problem).solve(values, sigma=sigma).theta
-    closure, columns = LoopClosure(robot), problem.functions.errors.unit_errors(names)
-    drives = closure.inverse(workspace.points)
-
-    def tools(values):
-        errors = closure.errors() + values[:, :n] @ columns.T
-        return closure.tcp(drives, closure.close(drives, errors=errors), errors=errors)
-
-    remaining = np.moveaxis(tools(fitted) - tools(theta), 0, -1)
-    aligned = workspace.remove_motion(remaining, workspace.points)
-    rms = float(np.sqrt(np.mean(workspace.weights @ (aligned**2).sum(axis=1))))
-    field = plan.forecast.align(plan.forecast.jacobian)
-    low, high = rms_band(field, workspace.weights, plan.expected.covariance, machines)
-    assert low < rms / plan.expected.reported.rms < high
-
-
 def test_calibrated_machines_have_the_expected_tool_error(planned):
-    assert_machines_have_the_expected_error(planned, machines=25)
+    assert_machines_have_the_expected_error(planned, offset_mm=0.4)
 
 
 def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
@@ -186,13 +145,6 @@ def test_readings_of_machines_at_tolerance_stay_in_the_gauges_range(planned):
     for seed in range(20):
         errors = draw_errors(robot, planned.forecast.selection.names, seed=seed, tolerances=OFFSETS)
         simulate_session(planned.session, errors, seed=seed)  # refuses readings beyond the range
-
-
-def test_a_setup_begins_and_ends_with_the_alignment_posture(planned):
-    for name in planned.session.setups:
-        rows = [r for r in planned.session.readings if r.setup == name]
-        assert (rows[0].posture, rows[0].cycle, rows[-1].cycle) == (rows[-1].posture, 1, 2)
-        assert len({r.posture for r in rows}) == len(rows) - 1
 
 
 def test_a_written_plan_is_measured_and_calibrated(planned, tmp_path):
@@ -225,13 +177,11 @@ def test_sections_near_the_tool_are_best_for_the_papers_six_equations(orthoglide
         across=0.0,
     )
     forecast = ToolForecast(orthoglide, Choice("offsets").select(orthoglide.parameters))
-    session = list_candidates(orthoglide, equipment)
-    # largest section at which the gauge touches the leg in all postures
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
-    n = len(candidates.state)
-    search = SetupSearch.of(candidates, 1e-8 * np.eye(n), forecast.weight_of("A", n))
-    found = search.choose([2] * 6, starts=4)
-    chosen = [session.setups[candidates.setups[s.candidate].name].sensor for s in found.setups]
+    candidates = candidates_of(forecast, equipment)
+    found = search_among(candidates, forecast, criterion="A", prior=1e-8).choose([2] * 6, starts=4)
+    setups = candidates.session.setups
+    chosen = [setups[candidates.setups[s.candidate].name].sensor for s in found.setups]
+    # the largest section at which the gauge touches the leg in all postures
     assert {s.section.value for s in chosen} == {0.8}
     # all six, or three of them twice, one for each leg, which have equal information
     assert sorted(s.leg for s in chosen) == list("xxyyzz")
@@ -304,12 +254,6 @@ def test_a_box_is_limited_to_the_reach_of_the_tool(orthoglide):
     assert np.array_equal(choose_box(orthoglide, beside), beside)
 
 
-def test_a_plan_uses_the_available_hours(orthoglide):
-    with uncompared(), few_machines():
-        plan = plan_readings(orthoglide, "full", hours=1.0, starts=1, equipment=Equipment(**FEW))
-    assert 45.0 < plan.minutes <= 60.0
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -351,10 +295,7 @@ def test_the_default_workspace_keeps_clear_of_the_end_of_the_reach(tmp_path, leg
 
 def make_search(robot, equipment):
     forecast = ToolForecast(robot, Choice("full").select(robot.parameters))
-    session = list_candidates(robot, equipment)
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
-    n = len(candidates.state)
-    return SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
+    return search_among(candidates_of(forecast, equipment, spare_range=3.0), forecast)
 
 
 def test_the_memory_of_a_plan_is_released_with_it(orthoglide):

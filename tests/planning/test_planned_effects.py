@@ -9,19 +9,13 @@ from datetime import timedelta
 import numpy as np
 import pytest
 from commands import run_orthocal
+from plan_searches import calibrate_drawn
 from uncompared import uncompared
 
-from orthocal import (
-    draw_errors,
-    load_plan,
-    simulate_session,
-    write_session,
-)
+from orthocal import load_plan, simulate_session, write_session
 from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
@@ -88,19 +82,10 @@ def test_readings_with_one_approach_do_not_determine_backlash(planned):
 
 @pytest.mark.slow
 def test_backlash_of_calibrated_machines_is_within_the_expected_limits(planned):
-    problem = CalibrationProblem(planned.session, planned.forecast.selection)
-    names, rng, count = problem.machine_selection.names, np.random.default_rng(0), 60
-    robot, scale = problem.session.robot, problem.theta_scale
-    theta = rng.normal(size=(count, problem.n_free)) * scale
-    for seed in range(count):
-        drawn = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 0.4})
-        theta[seed, : len(names)] = [drawn[n] for n in names]
-    values, _, reached = problem.simulate(theta)
-    assert reached.all()
-    sigma = stated_sigma(problem.session.gauge)
-    fit = BatchSolver(problem).solve(values + sigma * rng.normal(size=values.shape), sigma=sigma)
+    problem, theta, found = calibrate_drawn(planned, 60, offset_mm=0.4)
+    names = problem.machine_selection.names
     indices = [i for i, name in enumerate(names) if name.endswith(".backlash")]
-    deviation, true = (fit.theta - theta)[:, indices], theta[:, indices]
+    deviation, true = (found - theta)[:, indices], theta[:, indices]
     # near 0, where it cannot be negative, backlash is known better; the RMS of about 110 values
     # scatters by 7 %, and is 4 % larger, because the prior reduces the estimates
     expected = planned.forecast.about_nominal(planned.session)
@@ -135,15 +120,13 @@ def test_candidates_begin_their_approach_within_the_travel(machine):
     assert within.robot is machine
 
 
-@pytest.mark.parametrize("effects", [[], ["backlash"]])
-def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
+def test_programs_of_a_plan_are_within_the_soft_limits(machine):
     """The travel is 120 to 390 mm, and 310 mm in the mechanical zero."""
-    robot = with_effects(orthoglide, effects)
     joints, axes = ((0.262, 0.353),) * 3, ((-0.035, 0.045), (-0.05, 0.03), (-np.inf, 0.04))
     with uncompared():
         free, limited = (
-            plan_readings(robot, "offsets", setups=2, equipment=equipment, starts=1).session
-            for equipment in (FEW, FEW.within_limits(robot, joints, axes))
+            plan_readings(machine, "offsets", setups=2, equipment=equipment, starts=1).session
+            for equipment in (FEW, FEW.within_limits(machine, joints, axes))
         )
     beyond = describe_beyond_limits(free, joints, axes, file="machine.ini")
     assert re.search(r"(?m)^  AXIS_[XYZ], MAX_LIMIT", beyond)
@@ -159,7 +142,7 @@ def test_programs_of_a_plan_are_within_the_soft_limits(orthoglide, effects):
     assert reached
     assert all(np.abs(words - v).min() < 6e-4 for v in reached)  # rounded to 1 µm
     with pytest.raises(ParameterError, match=r"\[AXIS_Y\] leave no room"):
-        FEW.within_limits(robot, joints, (axes[0], (0.2, 0.3), axes[2]))
+        FEW.within_limits(machine, joints, (axes[0], (0.2, 0.3), axes[2]))
 
 
 def test_positions_lie_at_fractions_of_the_lead(orthoglide):

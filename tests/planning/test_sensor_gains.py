@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from unittest.mock import patch
 
 import pytest
 from calibrated import UNJUDGED
@@ -14,7 +15,7 @@ from uncompared import few_balls, uncompared
 from orthocal import calibrate, plan_readings, simulate_session, summarize
 from orthocal.output.report import page
 from orthocal.planning import plan as planning
-from orthocal.planning import sensor_gains
+from orthocal.planning import sensor_gains, tool_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.sensor_gains import find_sensor_gains
@@ -29,8 +30,8 @@ length_tolerance_mm: unknown
 
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """Three positions of a fixed ball, in place of eleven; plans alone."""
-    with few_balls(3), uncompared():
+    """Two positions of a fixed ball, few points on a bed, and plans alone."""
+    with few_balls(2), uncompared(), patch.object(tool_candidates, "BED_POINTS", 5):
         yield
 
 

@@ -8,11 +8,13 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import plans
 import pytest
-from bounds import rms_band
+from ball_bar_plans import circles
 from calibrated import identified
 from commands import run_orthocal
 from machines import frame_pose, frames
+from plan_searches import assert_machines_have_the_expected_error, candidates_of
 from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_NUMBER, SAME_OPTIMUM
 from uncompared import few_balls, few_machines, uncompared
@@ -23,7 +25,6 @@ from orthocal import (
     plan_readings,
     simulate_session,
     summarize,
-    write_session,
 )
 from orthocal.assessment.judgement import judge_session
 from orthocal.effects.loading import with_effects
@@ -50,7 +51,6 @@ from orthocal.planning.planned_session import _order_readings, build_session
 from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.planning.tool_candidates import list_tool_candidates, segment_distances
 from orthocal.sensors.ball_bar import SAGITTA, BallBar
-from orthocal.sensors.registry import read_setup
 from orthocal.session.points import names_in_files
 from orthocal.session.session import Conditions, Gauge, Reading, Session, Setup
 
@@ -166,57 +166,21 @@ def test_every_candidate_posture_touches_its_artefact(owned, orthoglide):
             assert np.ptp(points[:, axis]) == pytest.approx(0.0, abs=1e-12)
 
 
-def manual_plan(robot, bar, *, sweep):
-    """Three circles of 16 readings, and the paper's 18 readings or a sweep of 162 at the legs."""
-    names, points, setups, readings = ["zero"], [np.zeros(3)], {}, []
-    fractions = np.linspace(-1.0, 1.0, 9) if sweep else (-1.0, 1.0)
-    for axis, leg in enumerate(robot.legs.values()):
-        for part in fractions:
-            if abs(part) > 1e-9:
-                names.append(f"{leg.name}{part:+g}")
-                points.append(np.eye(3)[axis] * part * (0.06 if part > 0.0 else 0.1))
-        line = ["zero", *(n for n in names if n.startswith(leg.name))]
-        sections = (0.25, 0.5, 0.75) if sweep else (0.5,)
-        for direction, section in itertools.product("xyz".replace(leg.name, ""), sections):
-            name = f"{direction}{leg.name}_{section:g}"
-            (sensor,) = Equipment().list_sensors(leg, direction, section)
-            setups[name] = Setup(name, sensor, "dial")
-            readings += [Reading(name, posture) for posture in line]
-    _, ball = read_setup(
-        {**bar.keys, "centre_mm": [0, 0, 0], "ball": "table"},
-        where="",
-        under="",
-        error=SessionError,
-    )
-    angles = 2.0 * np.pi * np.arange(16) / 16
-    for axis in range(3):
-        circle = np.zeros((16, 3))
-        circle[:, axis - 2], circle[:, axis - 1] = np.cos(angles), np.sin(angles)
-        setups[f"bar_{axis}"] = Setup(f"bar_{axis}", ball, "bar", zero="known")
-        for i, point in enumerate(0.05 * circle):
-            names.append(f"bar_{axis}_{i}")
-            points.append(point)
-            readings.append(Reading(f"bar_{axis}", names[-1]))
-    return Session(
-        robot=robot,
-        robot_reference=robot.name,
-        gauges={"dial": Equipment().gauge, "bar": bar.gauge},
-        postures=place_tool(robot, names, np.array(points)),
-        setups=setups,
-        readings=tuple(readings),
+def manual_plans(folder):
+    """Three circles of a bar beside the paper's 18 readings, and beside 162 of the legs."""
+    sweep = {**plans.sweep(), "gauge": {"sigma_mm": 0.005, "resolution_mm": 0.01}}
+    bar = circles(folder / "bar")
+    return circles(folder / "paper", legs=True), join_sessions(
+        [bar, load_plan(plans.write(folder, sweep))]
     )
 
 
-def test_two_hours_are_better_than_manual_plans_of_two_and_five_hours(planned):
+def test_two_hours_are_better_than_manual_plans_of_two_and_five_hours(planned, tmp_path):
     """The paper's readings and circles need two hours, 162 readings and circles five."""
-    robot, equipment = planned.session.robot, planned.equipment
     assert planned.minutes <= 120.0 + 1e-9
-    assert planned.minutes == pytest.approx(equipment.minutes_of(planned.session))
+    assert planned.minutes == pytest.approx(planned.equipment.minutes_of(planned.session))
     assert {s.gauge for s in planned.session.setups.values()} == {"bar"}
-    paper, sweep = (
-        planned.forecast.after(manual_plan(robot, equipment.owned[0], sweep=s)).reported.rms
-        for s in (False, True)
-    )
+    paper, sweep = (planned.forecast.after(p).reported.rms for p in manual_plans(tmp_path))
     assert paper == pytest.approx(5.5e-6, rel=0.1)
     assert sweep < 5.0e-6
     assert planned.expected.reported.rms < min(4.0e-6, 0.9 * sweep) < paper
@@ -338,10 +302,13 @@ def test_the_tool_stays_in_the_box(owned, name, box):
 
 def test_a_bed_is_probed_in_one_setup_at_the_height_of_its_plane(owned):
     sensors = owned(probe=PROBE + "tool_mm: [0, 0, -20]\n")
-    _, postures, setups, readings = list_tool_candidates(load_robot("linear_delta"), sensors, None)
-    assert list(setups) == ["probe"]
-    assert len(readings) > 100
-    assert {p.values[2] for p in postures.values()} == {0.02}
+    for effects in ((), ("backlash",)):
+        robot = with_effects(load_robot("linear_delta"), effects)
+        _, postures, setups, readings = list_tool_candidates(robot, sensors, None)
+        assert list(setups) == ["probe"]
+        assert len(readings) > 100
+        assert {p.values[2] for p in postures.values()} == {0.02}
+        assert {r.approach for r in readings} == {"nnn"}
 
 
 def lowest(files):
@@ -351,14 +318,15 @@ def lowest(files):
     )
 
 
-def test_a_bed_is_probed_from_above(owned):
+def test_a_bed_is_probed_from_above(owned, monkeypatch):
     """The operator probes from 10 mm above. The tool moves back before the next posture."""
-    equipment, about = Equipment(owned=owned(probe=PROBE)), {"hours": 0.1, "starts": 1}
-    for effects in ((), ("backlash",)):
-        robot = replace(with_effects(load_robot("linear_delta"), effects), legs={})
-        with uncompared(), few_machines():
-            session = plan_readings(robot, "offsets", equipment=equipment, **about).session
-        assert {r.approach for r in session.readings} == {"nnn"}
+    equipment = Equipment(owned=owned(probe=PROBE))
+    robot = replace(load_robot("linear_delta"), legs={})
+    monkeypatch.setattr(tool_candidates, "BED_POINTS", 5)
+    with uncompared(), few_machines():
+        plan = plan_readings(robot, "offsets", equipment=equipment, hours=0.1, starts=1)
+    session = plan.session
+    assert {r.approach for r in session.readings} == {"nnn"}
     files = sheet_files(session, options=ProgramOptions(dwell=1.0))
     assert "begin 10 mm before the surface" in files["sheet.html"]
     assert "Move to the" not in files["sheet.html"]
@@ -386,15 +354,15 @@ def lowered(robot, posture, depth=1e-3):
 def test_plans_of_a_machine_with_a_bed_stay_above_it(owned):
     """Postures, approaches and paths of gauges at the rods and of a ball bar."""
     robot = with_effects(load_robot("linear_delta"), ("backlash",))
-    for box in (None, np.array([[-0.06, 0.06]] * 3)):  # the plan is for the box that the bed cuts
-        equipment = Equipment(owned=owned(bar=BAR), box=box, along=4, sections=(0.5,))
-        listed = list_candidates(robot, equipment)
-        of_rods = {r.posture for r in listed.readings if r.setup[0] != "b"}
-        at_bed = {n for n, p in listed.postures.items() if p.values[2] == 0.0}
-        assert min(p.values[2] for p in listed.postures.values()) == 0.0
-        assert {r.approach for r in listed.readings if r.posture in at_bed & of_rods} == {"nnn"}
+    box = np.array([[-0.06, 0.06]] * 3)  # the bed cuts it
+    equipment = Equipment(owned=owned(bar=BAR), box=box, along=4, sections=(0.5,))
     with few_balls(1), uncompared(), few_machines():
+        listed = list_candidates(robot, equipment)
         plan = plan_readings(robot, "offsets", hours=1.0, equipment=equipment, starts=1).session
+    of_rods = {r.posture for r in listed.readings if r.setup[0] != "b"}
+    at_bed = {n for n, p in listed.postures.items() if p.values[2] == 0.0}
+    assert min(p.values[2] for p in listed.postures.values()) == 0.0
+    assert {r.approach for r in listed.readings if r.posture in at_bed & of_rods} == {"nnn"}
     assert {s.gauge for s in plan.setups.values()} == {"dial", "bar"}
     assert lowest(sheet_files(plan)) >= 0.0
     depth = 1e-3 + min(p.values[2] for p in plan.postures.values())
@@ -415,10 +383,9 @@ def planned_bar(owned):
     """Candidates and a planned setup of a ball bar with twelve postures."""
     robot = replace(with_effects(load_robot("linear_delta"), ["backlash"]), legs={})
     equipment = Equipment(owned=owned(bar=BAR.replace("length_mm: 50", "length_mm: 60")))
-    with few_balls(1):
-        session = list_candidates(robot, equipment)
     forecast = ToolForecast(robot, resolve_choice("offsets", None).select(robot.parameters))
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
+    with few_balls(1):
+        candidates = candidates_of(forecast, equipment)
     count = len(candidates.setups[0].rows)
     planned = [PlannedSetup(0, tuple(np.random.default_rng(0).permutation(count)[:12].tolist()))]
     return candidates, planned
@@ -564,42 +531,34 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
 
 
 @pytest.mark.usefixtures("without_sensor_gains")
-def test_a_sensor_with_too_short_a_range_is_named(owned):
+def test_sensors_with_too_short_a_range_or_less_gain_are_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
-    short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
+    short, noisy = BAR.replace("[-25, 25]", "[-2, 2]"), BAR.replace("0.002", "1")
+    equipment = Equipment(owned=owned(short=short, noisy=noisy), **FEW)
     with few_balls(1), uncompared(), few_machines():
-        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
+        plan = plan_readings(robot, hours=0.3, equipment=equipment, starts=1)
     assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
-    assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
-    title, *_, last = summarize(plan).split("\n\n")
-    assert title.endswith("min, without bar")
+    assert json.loads(plan_json(plan))["unusable_mm"]["short"] == pytest.approx(4.3, abs=0.1)
+    assert plan.unchosen == {"noisy": 0.0}
+    title, *_ = summarize(plan).split("\n\n")
+    assert " ".join(title.split()).endswith("min, without short and noisy")
+    unused, unchosen = describe_absent(plan)
     remedy = (
         "To plan with it, state smaller tolerances (centre_tolerance_mm and length_tolerance_mm)"
     )
     entering = "or enter offsets of other readings first and plan from their session."
-    assert " ".join(last.split()).startswith("Not in the plan: bar. Within the tolerances")
-    assert " ".join(last.split()).endswith(f"{remedy}, use a gauge of more range {entering}")
-    active = plan.session.with_controller([1e-3, 0.0, 0.0])  # offsets are entered already
-    (words,) = describe_absent(replace(plan, complements_session=True, session=active))
-    assert words.endswith(f"{remedy} or use a gauge of more range.")
-
-
-@pytest.mark.usefixtures("without_sensor_gains")
-def test_a_sensor_that_gains_less_than_others_is_named(owned):
-    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
-    noisy = owned(bar=BAR.replace("sigma_mm: 0.002", "sigma_mm: 1"))
-    with few_balls(1), uncompared(), few_machines():
-        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=noisy, **FEW), starts=1)
-    assert plan.unchosen == {"bar": 0.0}
-    title, *_, last = summarize(plan).split("\n\n")
-    assert title.endswith("min, without bar")
+    assert unused.startswith("Not in the plan: short. Within the tolerances")
+    assert unused.endswith(f"{remedy}, use a gauge of more range {entering}")
     better = (
-        "Not in the plan: bar. In this time other readings reduce the expected tool error more."
+        "Not in the plan: noisy. In this time other readings reduce the expected tool error more."
     )
-    assert " ".join(last.split()) == better
-    (words,) = describe_absent(replace(plan, unchosen={"bar": 6e-3}))
-    assert words.startswith(f"{better} Within the tolerances of machine, place and gauge many of ")
-    assert "±6.0 mm, beyond its range" in words
+    assert unchosen == better
+    active = plan.session.with_controller([1e-3, 0.0, 0.0])  # offsets are entered already
+    entered = replace(plan, complements_session=True, session=active, unchosen={"noisy": 6e-3})
+    unused, unchosen = describe_absent(entered)
+    assert unused.endswith(f"{remedy} or use a gauge of more range.")
+    assert unchosen.startswith(f"{better} Within the tolerances of machine, place and gauge many ")
+    assert "±6.0 mm, beyond its range" in unchosen
 
 
 @pytest.mark.parametrize("names", [("dial",), ("bar", "bar")])
@@ -657,23 +616,19 @@ def test_a_plan_of_points_is_one_setup_within_its_time(tracked):
 
 def search_plan(robot, sensors, counts, measured=None):
     """Plan without closing readings, the error of its search, and the forecast of lengths alone."""
-    session = list_candidates(robot, Equipment(owned=sensors))
     selection = resolve_choice("lengths", None).select(robot.parameters)
     forecast = ToolForecast(robot, selection, others={})
-    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
-    search = SetupSearch.of(
-        candidates,
-        forecast.prior_information(candidates.problem, candidates.state, measured),
-        forecast.weight_of("aligned", len(candidates.state)),
-    )
-    planned = search.choose(counts, starts=1)
+    candidates = candidates_of(forecast, Equipment(owned=sensors))
+    prior = forecast.prior_information(candidates.problem, candidates.state, measured)
+    weight = forecast.weight_of("aligned", len(candidates.state))
+    planned = SetupSearch.of(candidates, prior, weight).choose(counts, starts=1)
     plan = build_session(candidates, planned.setups, measured)
     once = replace(plan, readings=tuple(r for r in plan.readings if r.cycle == 1))
     return once, planned.error, forecast
 
 
 @pytest.mark.parametrize("keys", ["", "frame: {tolerance_mm: 1, tolerance_mrad: 2}\n", CORRELATED])
-def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
+def test_the_candidates_of_points_agrees_with_the_forecast(owned, keys):
     plan, error, forecast = search_plan(without_legs(), owned(track=TRACKER + keys), [7])
     assert len(plan.readings) == 21
     assert error == pytest.approx(forecast.about_nominal(plan).reported.rms, rel=1e-6)
@@ -682,17 +637,14 @@ def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
 @pytest.mark.parametrize(
     "keys",
     [
-        "length_mm: 50\nlength_tolerance_mm: unknown\n",
-        "length_mm: 50\nlength_tolerance_mm: 0.01\n",
-        "length_mm: 50\nlength_tolerance_mm: 0\nscale_tolerance: 0.1\n",
         "length_mm: 60\nlength_tolerance_mm: 0.01\n",
+        "length_mm: 50\nlength_tolerance_mm: 0\nscale_tolerance: 0.1\n",
     ],
 )
 def test_the_search_beside_readings_of_the_same_bar_agrees_with_the_forecast(owned, keys):
-    """The bar was stated with other tolerances, or had another length."""
     robot = without_legs()
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-25, 25]\n"
-    with few_balls(3):
+    with few_balls(2):
         measured, *_ = search_plan(robot, owned(bar=bar + keys), [6, 6])
         plan, error, forecast = search_plan(robot, owned(bar=BAR), [5, 5], measured)
     joined = join_sessions([measured, plan])
@@ -700,10 +652,10 @@ def test_the_search_beside_readings_of_the_same_bar_agrees_with_the_forecast(own
 
 
 def test_the_search_beside_joined_readings_agrees_with_the_forecast(owned):
-    """The bar that is planned is that of the second session."""
+    """The first bar had another length, the second one, which is planned, another tolerance."""
     robot = without_legs()
     bars = BAR.replace("50", "60").replace("unknown", "0.01"), BAR.replace("unknown", "0.1")
-    with few_balls(3):
+    with few_balls(2):
         sessions = [search_plan(robot, owned(bar=bar), [6])[0] for bar in bars]
         measured = join_sessions(sessions)
         plan, error, forecast = search_plan(robot, owned(bar=BAR), [5, 5], measured)
@@ -730,27 +682,9 @@ def tool_rms(forecast, remaining):
     return float(np.sqrt(forecast.workspace.weights @ (field**2).sum(axis=1)))
 
 
-def assert_machines_have_the_expected_error(plan, *, count):
-    """Compare calibrated machines with all errors with the expected error of their plan."""
-    forecast, problem = plan.forecast, plan.forecast.problem(plan.session)
-    program, n = VariableProjection(problem), problem.n_machine
-    sizes = []
-    for seed in range(count):
-        errors = draw_errors(plan.session.robot, forecast.names, seed=seed)
-        shown = simulate_session(plan.session, errors, seed=seed).session
-        values = problem.observations.values(shown.values) / problem.noise_ratio
-        fit = program.solve(sigma=stated_sigma(plan.session.gauge), values=values)
-        true = np.array([errors[name] for name in problem.free[:n]])
-        sizes.append(tool_rms(forecast, fit.theta[:n] - true))
-    field = forecast.align(forecast.jacobian)
-    low, high = rms_band(field, forecast.workspace.weights, plan.expected.covariance, count)
-    ratio = np.sqrt(np.mean(np.square(sizes))) / plan.expected.reported.rms
-    assert low < ratio < high, (low, ratio, high)
-
-
 def test_calibrated_machines_have_the_expected_error_of_points(tracked):
     """The position of the instrument is unknown."""
-    assert_machines_have_the_expected_error(tracked, count=8)
+    assert_machines_have_the_expected_error(tracked, count=15)
 
 
 def test_the_curve_grows_a_setup_that_can_be_used_once(tracked):
@@ -792,24 +726,6 @@ def test_a_plan_of_points_is_measured_and_calibrated(tmp_path):
     simulated = [str(tmp_path / "plan"), "--out", measured, "--draw", "*", "--seed", "1"]
     assert run_orthocal(".", "simulate", *simulated)[0] == 0
     assert run_orthocal(".", "calibrate", measured, "--json")[0] == 0
-
-
-def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
-    """Each principal axis of a covariance has a gauge in the session; the file has one gauge."""
-    session = list_candidates(
-        entered("orthoglide"), Equipment(owned=owned(track=TRACKER + CORRELATED), **QUICK)
-    )
-    dial = next(r for r in session.readings if r.setup == "yx@a_0.5")
-    of_point = [r for r in session.readings if r.setup.startswith("track")][:12]
-    few = replace(session, robot_reference="orthoglide").select([dial, *of_point])
-    write_session(few, tmp_path / "few", blank=True)
-    again = load_plan(tmp_path / "few")
-    assert [(r.setup, r.posture) for r in again.readings] == [
-        (r.setup, r.posture) for r in few.readings
-    ]
-    assert {n: again.gauges[s.gauge].sigma for n, s in again.setups.items()} == pytest.approx(
-        {n: few.gauges[s.gauge].sigma for n, s in few.setups.items()}
-    )
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calibrated import session_of
+from calibrated import EXPERIMENT_2, UNJUDGED, session_of
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import orthocal
@@ -27,6 +27,6 @@ def test_a_calibration_uses_one_thread_and_restores_the_others(monkeypatch):
     for name in NUMBERS_OF_THREADS:
         monkeypatch.delenv(name, raising=False)
     with threadpool_limits(2):
-        orthocal.calibrate(session_of("table1/experiment-2"), solver="variable-projection")
+        orthocal.calibrate(session_of(EXPERIMENT_2), **UNJUDGED)
         assert blas_threads() == {2}
     assert during == [{1}]

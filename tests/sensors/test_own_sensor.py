@@ -10,7 +10,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from calibrated import SOUND, identified
+from calibrated import UNJUDGED, identified
 from conftest import marked_plots
 from gauges import exact
 from intervals import recorded_scores
@@ -18,21 +18,31 @@ from scipy.stats import chi2
 from tolerances import SAME_OPTIMUM
 from tool_coordinate import ToolCoordinate
 
-from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
+from orthocal import (
+    SolverOptions,
+    calibrate,
+    draw_scene,
+    load_calibration,
+    load_plan,
+    simulate_session,
+    summarize,
+)
 from orthocal.calibration import build_record
 from orthocal.calibration.file import calibration_json, write_calibration
-from orthocal.cli import make_program
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.simulate import draw_errors
+from orthocal.output.report.page import build_report
+from orthocal.runtime.disk_cache import cache_folder
 from orthocal.sensors import registry
 from orthocal.sensors.compiled import compile_reading
 from orthocal.session.session import Conditions
@@ -88,8 +98,6 @@ def measured(plan):
 def test_its_readings_are_those_of_the_tool(plan):
     o = build_observations(plan)
     found = predict_readings(plan, TRUTH, observations=o, nuisance=np.array([1e-3, -2e-3]))
-    from orthocal.kinematics.loop_closure import LoopClosure
-
     drives = np.array([p.drives for p in plan.postures.values()])
     tool = LoopClosure(plan.robot, fixed=TRUTH).forward(drives)
     for setup, slope in enumerate((1e-3, 1e-3, -2e-3)):
@@ -126,22 +134,6 @@ def test_nuisance_parameters_are_identified_with_the_machine(plan):
     assert [p.name for p in result.free] == list(TRUTH)
 
 
-def simulated_fits(plan, count, others=()):
-    """Truth by name, and fit, of simulated sessions; errors named `others` are drawn."""
-    planned = build_problem(plan, model="offsets")
-    for seed in range(count):
-        errors = {**(draw_errors(plan.robot, others, seed=seed) if others else {}), **TRUTH}
-        simulated = simulate_session(plan, errors, seed=seed)
-        problem = planned.with_values(simulated.session.values)
-        yield {**TRUTH, **simulated.nuisance}, fit_problem(problem, options=FAST)
-
-
-def assert_unit_variance(scores):
-    """Compare the squares of independent standard normal scores with the 99 % band of χ²."""
-    low, high = chi2.interval(0.99, np.size(scores))
-    assert low < np.square(scores).sum() < high
-
-
 def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     """12 machines: offsets and slopes against standard deviations with unmodelled errors.
 
@@ -149,7 +141,12 @@ def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     """
     others = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     of_offsets, of_slopes = [], []
-    for truth, fit in simulated_fits(plan, 12, others):
+    planned = build_problem(plan, model="offsets")
+    for seed in range(12):
+        errors = {**draw_errors(plan.robot, others, seed=seed), **TRUTH}
+        simulated = simulate_session(plan, errors, seed=seed)
+        truth = {**TRUTH, **simulated.nuisance}
+        fit = fit_problem(planned.with_values(simulated.session.values), options=FAST)
         result = build_record.assemble_calibration(fit)
         of_offsets.append(recorded_scores(result, TRUTH)[0])
         total = np.sqrt(np.diag(result.total_covariance))
@@ -158,7 +155,8 @@ def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     estimates = (*result.free, *result.sensors)
     assert [p.name for p in estimates] == list(fit.problem.free)
     assert [p.value for p in estimates] == fit.solution.theta.tolist()
-    assert_unit_variance(of_offsets)
+    low, high = chi2.interval(0.99, np.size(of_offsets))
+    assert low < np.square(of_offsets).sum() < high
     # the noise of the slopes is that of the residuals, which contain the other errors
     count = np.size(of_slopes)
     assert np.square(of_slopes).sum() < chi2.ppf(0.995, count)
@@ -190,7 +188,7 @@ def test_it_is_written_and_read(plan, measured, tmp_path):
     again = load_session(path)
     assert [s.sensor for s in again.setups.values()] == [s.sensor for s in plan.setups.values()]
     assert [s.gauge for s in again.setups.values()] == ["fine"] * 3 + ["dial"] * 2
-    result = calibrate(again, solver=FAST, judgement=SOUND)
+    result = calibrate(again, **UNJUDGED)
     write_calibration(result, tmp_path / "calibration.json")
     loaded = load_calibration(tmp_path / "calibration.json")
     assert json.loads(calibration_json(loaded)) == json.loads(calibration_json(result))
@@ -199,19 +197,12 @@ def test_it_is_written_and_read(plan, measured, tmp_path):
 
 
 @pytest.mark.usefixtures("short_reports", "without_sensor_gains")
-def test_it_is_in_answer_report_and_scene(measured, tmp_path, capsys):
-    path = write_session(measured, tmp_path / "s")
+def test_it_is_in_answer_report_and_scene(measured):
+    calibration = calibrate(measured, **UNJUDGED)
+    assert "legs x, y and the tool" in " ".join(summarize(calibration).split())
     with marked_plots():
-        make_program()(
-            ["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False
-        )
-    answer = capsys.readouterr().out
-    assert "legs x, y and the tool" in answer
-    assert "dial.d.slope" in (tmp_path / "out/report.html").read_text()
-    make_program()(
-        ["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False
-    )
-    assert "tool" in (tmp_path / "v.html").read_text()
+        assert "dial.d.slope" in build_report(calibration)
+    assert "tool" in draw_scene(calibration).to_html()
 
 
 def test_what_does_not_fit_is_refused_by_key(tmp_path):
@@ -286,7 +277,6 @@ print(float(h[0, 0]))
 
 def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root, monkeypatch, capsys):
     """What is kept on disk is of the code that it was built by, of sensors from outside, too."""
-    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # both modules are as long and as old
     code = OWN.format(folder=str(tmp_path))
@@ -302,12 +292,13 @@ def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root, monkeypatch
         )
 
     write(1.0)
+    kept = set(cache_folder().iterdir())
     try:
         exec(code, {})
     finally:
         sys.modules.pop("own", None)
     before = float(capsys.readouterr().out)
-    assert list((tmp_path / "cache").iterdir())
+    assert set(cache_folder().iterdir()) > kept
     write(5.0)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) == pytest.approx(5.0 * before, rel=1e-12)

@@ -37,13 +37,5 @@ def test_setups_of_the_page_are_simulated_and_judged_sound(tmp_path, block):
 
 def test_the_page_shows_every_kind():
     shown = {k for block in BLOCKS for k in re.findall(r"sensor: (\w+)", block)}
-    assert (
-        shown
-        == {k for k in sensor_kinds() if k in shown}
-        >= {
-            "ball_bar",
-            "tool_indicator",
-            "probe",
-            "points",
-        }
-    )
+    assert shown <= set(sensor_kinds())
+    assert shown >= {"ball_bar", "tool_indicator", "probe", "points"}

@@ -14,14 +14,7 @@ from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import (
-    load_plan,
-    load_robot,
-    load_session,
-    simulate_session,
-    write_session,
-)
-from orthocal.errors import SessionError
+from orthocal import load_plan, load_robot, simulate_session
 from orthocal.kinematics.workspace import cube
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
@@ -267,29 +260,3 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
         part()
     space = cube(orthoglide, points_per_side=3)
     assert_promises(calibrate_machines(made.load(tmp_path), space, count=40))
-
-
-def test_a_session_comes_back_from_its_files(tmp_path):
-    session = simulate_session(complete_plan(tmp_path), ERRORS, seed=3).session
-    write_session(session, tmp_path / "session")
-    again = load_session(tmp_path / "session")
-    for name, setup in session.setups.items():
-        assert again.setups[name].sensor == setup.sensor
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "place"),
-    [
-        ("direction: y", "direction: w", "direction"),
-        ("along: x", "along: y", "artefact.along"),
-        ("kind: square", "kind: circle", "artefact"),
-        ("height_mm: 50", "height_mm: 0.05", "height_mm"),
-    ],
-)
-def test_a_wrong_key_is_refused_by_name(tmp_path, old, new, place):
-    complete_plan(tmp_path)
-    file = tmp_path / "plan.yaml"
-    file.write_text(file.read_text().replace(old, new, 1))
-    with pytest.raises(SessionError) as caught:
-        load_plan(file)
-    assert place in str(caught.value.where)

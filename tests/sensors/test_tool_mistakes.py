@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_ball_bar import circles
-from test_tool_indicator import AXES, STEPS, Plan
+from ball_bar_plans import circles
+from test_tool_indicator import AXES, BLOCK, STEPS, Plan
 
 from orthocal import draw_errors, simulate_session
 from orthocal.assessment.judgement import judge_session
@@ -16,7 +16,6 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nominal_values, nuisance_parameters
 
 SQUARE = "kind: square, name: granite, square_tolerance_mrad: 1, straight_tolerance_mm: 0.002"
-BLOCK = "kind: gauge_block, height_mm: 50, height_tolerance_mm: 0.0005, table_mm: -25"
 
 
 def errors_of(plan, seed):
@@ -98,7 +97,6 @@ def test_a_later_bar_with_all_signs_reversed_is_named(tmp_path):
     errors = errors_of(plan, 2)
     legs = simulate_session(first, errors, seed=2).session
     bar = simulate_session(later, errors, seed=52).session
-    assert not warnings_of(join_sessions([legs, bar]))
     (found,) = warnings_of(join_sessions([legs, bar.with_values(-bar.values)]))
     assert found.kind == "reversed sign"
     assert [p.setup for p in found.places] == ["session-2/xy"]
@@ -143,12 +141,10 @@ def turned_over(tmp_path_factory):
     return simulate_session(plan, errors_of(plan, 0), seed=0).session
 
 
-def test_a_square_that_was_turned_over_as_stated_is_not_accused(turned_over):
-    assert warnings_of(turned_over) == []
-
-
 @pytest.mark.parametrize("wrong", [("over_x", "over_y"), ("over_y",)], ids="-".join)
 def test_a_square_that_was_turned_over_unstated_is_named(turned_over, wrong):
+    if len(wrong) == 2:
+        assert warnings_of(turned_over) == []
     found = warnings_of(with_artefact(turned_over, wrong, reversed=False))
     assert len(found) == 1
     assert found[0].kind == ("displaced artefact" if len(wrong) == 2 else "ambiguous")
@@ -187,7 +183,6 @@ def test_a_bar_that_was_zeroed_on_the_machine_is_named(tmp_path):
         setups={n: replace(s, sensor=sensors[n], zero="known") for n, s in plan.setups.items()},
     )
     session = simulate_session(plan, errors_of(plan, 1), seed=1).session
-    assert warnings_of(session) == []
     zeros = {"xy": 0.31e-3, "yz": -0.22e-3, "zx": 0.17e-3}
     session = session.with_values([r.value + zeros[r.setup] for r in session.readings])
     found = warnings_of(session)
@@ -224,17 +219,13 @@ def two_sessions(folder, seed, *, change, stated=None):
 
 
 def test_a_bar_that_was_readjusted_between_sessions_is_named(tmp_path):
+    assert warnings_of(two_sessions(tmp_path, 0, change=0.0)) == []
     change = 60e-6
-    session = two_sessions(tmp_path, 1, change=change)
-    (found,) = warnings_of(session)
+    (found,) = warnings_of(two_sessions(tmp_path, 1, change=change))
     assert found.kind == "readjusted dimension"
     assert {p.setup for p in found.places} == {"session-2/xy", "session-2/yz", "session-2/zx"}
     assert found.numbers["dimension_mm"] == pytest.approx(50.0 + 1e3 * change, abs=0.01)
     assert "before session session-2" in found.text
-
-
-def test_sessions_with_one_bar_are_not_accused(tmp_path):
-    assert warnings_of(two_sessions(tmp_path, 0, change=0.0)) == []
 
 
 @pytest.mark.parametrize("stated", ["name", "length"])
@@ -243,17 +234,11 @@ def test_a_bar_of_another_name_or_stated_length_has_another_length(tmp_path, sta
     session = two_sessions(tmp_path, 1, change=-0.3e-3, stated=stated)
     assert warnings_of(session) == []
     names = {p.name for p in nuisance_parameters(session).parameters if "gauge" in p.name}
-    assert (
-        names
-        == {"gauge.bar.length", "gauge.bar.scale"}
-        | {
-            "name": {"gauge.other.length", "gauge.other.scale"},
-            "length": {"gauge.session-2/bar.length"},
-        }[stated]
-    )
+    later, length, more = {
+        "name": ("gauge.other", 50e-3, {"gauge.other.scale"}),
+        "length": ("gauge.session-2/bar", 50.5e-3, set()),
+    }[stated]
+    assert names == {"gauge.bar.length", "gauge.bar.scale", f"{later}.length", *more}
     values = nominal_values(session)
-    later = {"name": "other", "length": "session-2/bar"}[stated]
     assert values["gauge.bar.length"] == pytest.approx(50e-3)
-    assert values[f"gauge.{later}.length"] == pytest.approx(
-        50.5e-3 if stated == "length" else 50e-3
-    )
+    assert values[f"{later}.length"] == pytest.approx(length)

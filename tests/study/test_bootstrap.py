@@ -37,16 +37,16 @@ def test_scatter_agrees_with_the_covariance(many_cycles, by):
     if by == "residuals":
         rows = [r for r in many_cycles.readings if r.cycle <= FEWER_CYCLES]
         many_cycles = many_cycles.select(rows)
-    study = build_bootstrap_study(many_cycles, "offsets", by=by, draws=1000)
+    study = build_bootstrap_study(many_cycles, "offsets", by=by, draws=500)
     found = summarise_bootstrap(study, run_study(study))
     assert found.fewest_cycles == (CYCLES if by == "cycles" else None)
     for p in found.parameters:
         # the standard error of the ratio is 1/√(2 dof), for residuals and for 40 cycles of 6 setups
         assert p.std / p.predicted == pytest.approx(1.0, abs=0.15)
         assert p.low < p.estimate < p.high
-        # the standard error of the width is 3.1 % with 1000 draws
-        assert p.high - p.low == pytest.approx(2 * 1.96 * p.std, rel=0.08)
-        assert p.standard_error == pytest.approx(p.std / np.sqrt(2 * 999), rel=1e-9)
+        # the standard error of the width is 4.4 % with 500 draws
+        assert p.high - p.low == pytest.approx(2 * 1.96 * p.std, rel=0.11)
+        assert p.standard_error == pytest.approx(p.std / np.sqrt(2 * 499), rel=1e-9)
 
 
 @pytest.mark.parametrize("order", [("coarse", "fine"), ("fine", "coarse")])
@@ -56,7 +56,7 @@ def test_gauges_have_their_own_noise(many_cycles, order):
     gauges = {name: Gauge({"coarse": 20e-6, "fine": 2e-6}[name]) for name in order}
     plan = with_gauges(plan, gauges, set(list(plan.setups)[:3]))
     session = simulate_session(plan, {"x_slide.offset": 0.5e-3}, seed=1).session
-    study = build_bootstrap_study(session, "offsets", draws=400)
+    study = build_bootstrap_study(session, "offsets", draws=200)
     for p in summarise_bootstrap(study, run_study(study)).parameters:
         assert p.low < p.estimate < p.high
         assert p.std / p.predicted == pytest.approx(1.0, abs=0.3)
@@ -88,11 +88,9 @@ def test_cycles_in_another_order_of_approaches_are_the_same():
             (readings[i].posture, readings[i].approach) for i in other
         ]
     turned = [replace(r, cycle=2, conditions=replace(r.conditions, approach="uuu")) for r in first]
+    both = replace(plan, readings=(*first, *turned))
     with pytest.raises(SessionError, match="different postures or conditions"):
-        find_cycles(
-            replace(plan, readings=(*first, *turned)),
-            build_observations(replace(plan, readings=(*first, *turned))),
-        )
+        find_cycles(both, build_observations(both))
 
 
 def test_studies_of_other_orders_are_others(many_cycles):
@@ -117,32 +115,19 @@ def test_draws_consist_of_complete_cycles(raw_cycles):
         assert {tuple(drawn[c]) for c in cycles} <= known
 
 
-def test_rescaled_residuals_have_the_size_of_the_noise(many_cycles):
-    prepared = build_bootstrap_study(many_cycles, "offsets", draws=2).prepare()
-    sigma = many_cycles.gauge.sigma
-    resolution = many_cycles.gauge.resolution or 0.0
-    expected = np.hypot(sigma, resolution / np.sqrt(12))
-    assert prepared.residuals.std() == pytest.approx(expected, rel=0.08)
-    assert abs(prepared.residuals.mean()) < 1e-18
-
-
 def test_model_std_includes_the_prior(root):
     session = load_session(root / "examples/sweep")
-    study = build_bootstrap_study(session, "lengths", draws=60)
+    study = build_bootstrap_study(session, "lengths", draws=2)
     found = summarise_bootstrap(study, run_study(study))
     assert all(p.predicted < p.model_std for p in found.parameters)
 
 
-def test_session_without_residuals_or_cycles(root):
+def test_session_without_residuals(root):
     with pytest.raises(SessionError, match="has no residuals to resample"):
         build_bootstrap_study(load_session(root / "examples/workshop"), "full")
-    with pytest.raises(SessionError, match=r"setups\.\w+: has one cycle of readings"):
-        build_bootstrap_study(load_session(root / "examples/workshop"), "offsets", by="cycles")
 
 
 def test_cycles_with_different_postures(raw_cycles):
-    from dataclasses import replace
-
     short = replace(raw_cycles, readings=raw_cycles.readings[1:])
     with pytest.raises(SessionError, match="has cycles with different postures"):
         build_bootstrap_study(short, by="cycles")

@@ -6,7 +6,6 @@ import closed_form
 import numpy as np
 import pytest
 from gauges import exact, with_gauges
-from tolerances import THREE_DECIMALS_MM
 
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
@@ -15,7 +14,9 @@ from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.linear import linearise_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.planning.first_plan import Displacements
 from orthocal.session.session import Gauge
+from orthocal.statistics.zeros import project_out_zeros
 from orthocal.study.linearisation import (
     IDENTIFIED,
     METHODS,
@@ -41,12 +42,6 @@ def summary(study):
 
 def method(summary, name):
     return next(m for m in summary.methods if m.name == name)
-
-
-def test_linearisation_errors_of_readings(orthoglide):
-    study = build_linearisation_study(orthoglide, sizes=[1.0, 2.0, 5.0], along=ALONG)
-    found = run_task(study, 0)["reading_mm"]
-    assert np.abs(np.array(found) - [0.0015, 0.006, 0.039]).max() * 1e-3 < THREE_DECIMALS_MM
 
 
 def test_linearisation_errors_agree_with_the_closed_forms(orthoglide):
@@ -118,8 +113,6 @@ def test_batch_step_equals_single_gauss_newton_steps(study):
     theta = 0.8 * errors
     found, alive = prepared.step(read, theta)
     assert alive.all()
-    from orthocal.statistics.zeros import project_out_zeros
-
     for y, at, step in zip(read, theta, found, strict=True):
         reading, jacobian = problem.predict_and_jacobian(at)
         slopes = project_out_zeros(jacobian, problem.observations)
@@ -144,8 +137,6 @@ def test_order_of_convergence(summary):
 def test_gauss_newton_diverges_on_short_legs(tmp_path):
     """A machine of short legs, 60 mm off."""
     robot = make_robot(Orthoglide(leg=0.15, travel=(0.06, 0.24), attachment=0.02), tmp_path / "m")
-    from orthocal.planning.first_plan import Displacements
-
     study = build_linearisation_study(
         robot, sizes=[1.0, 60.0], directions=4, displacements=Displacements(0.03, -0.05)
     )
@@ -186,39 +177,16 @@ def test_machines_without_contact_are_counted(root):
     assert summarise_linearisation(study, table).measurable == 1.0
 
 
-def test_paper_plan_requires_an_orthoglide(biglide):
-    with pytest.raises(ParameterError, match="has no legs x, y, z along these axes"):
-        build_linearisation_study(biglide)
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
         ({"free": ["*.scale"]}, ParameterError, "--free: expected lengths and angles"),
-        ({"along": [1.0, 2.0]}, ParameterError, "--along: found 1, 2; expected 3 numbers"),
         ({"along": [0.0, 0.0, 0.0]}, ParameterError, "not all 0"),
     ],
 )
 def test_invalid_arguments(orthoglide, arguments, error, message):
     with pytest.raises(error, match=message):
         build_linearisation_study(orthoglide, **arguments)
-
-
-def test_standard_errors_do_not_depend_on_the_order_of_gauges(root):
-    """Readings are weighted by the noise of their own gauge."""
-    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
-    errors = []
-    for order in (("coarse", "fine"), ("fine", "coarse")):
-        gauges = {name: Gauge({"coarse": 20e-6, "fine": 2e-6}[name]) for name in order}
-        session = with_gauges(plan, gauges, set(list(plan.setups)[:3]))
-        study = build_linearisation_study(session, count=2, directions=2, largest=1.0)
-        errors.append(study.standard_errors["exact"])
-    sigma = np.array([2e-6 if i < 3 else 20e-6 for i in range(6)])
-    problem = build_problem(session, model="offsets")
-    jacobian = linearise_problem(problem).jacobian / problem.theta_scale
-    weighted = jacobian / sigma[problem.observations.setup][:, None]
-    expected = np.sqrt(np.linalg.inv(weighted.T @ weighted).diagonal().max())
-    assert errors == pytest.approx([expected] * 2, rel=1e-6)
 
 
 @pytest.mark.parametrize("order", [("coarse", "fine"), ("fine", "coarse")])
@@ -235,6 +203,8 @@ def test_readings_are_weighted_by_the_noise_of_their_gauge(root, order):
     jacobian = linearise_problem(problem).jacobian / problem.theta_scale
     sigma = np.array([2e-6 if i < 3 else 20e-6 for i in range(6)])[problem.observations.setup]
     rows = np.hstack([jacobian, problem.zero_incidence]) / sigma[:, None]
+    variances = np.linalg.inv(rows.T @ rows).diagonal()[:3]
+    assert study.standard_errors["exact"] == pytest.approx(np.sqrt(variances.max()), rel=1e-6)
     found = np.linalg.lstsq(rows, change / sigma)[0][:3]
     assert columns["first_order"] == pytest.approx([np.abs(found - truth).max() * 1e3], rel=1e-6)
     remaining = change - jacobian @ truth
@@ -247,13 +217,6 @@ def test_unidentifiable_errors(orthoglide):
     study = build_linearisation_study(orthoglide, free=["x_slide.offset", "x_swivel.x"])
     with pytest.raises(NotIdentifiableError):
         study.prepare()
-
-
-def test_noise_and_resolution_of_the_gauge(orthoglide):
-    study = build_linearisation_study(orthoglide, gauge=Gauge(1e-6, 2e-6, None))
-    assert study.resolution == 2e-6
-    assert study.sigma == pytest.approx(np.hypot(1e-6, 2e-6 / np.sqrt(12)))
-    assert exact(study.session).setups.keys() == study.session.setups.keys()
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

@@ -11,7 +11,7 @@ from machines import place
 
 from orthocal import load_plan
 from orthocal.effects.compensation import JointTrim
-from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.session.session import Gauge
 from orthocal.study.runner import run_study
@@ -130,16 +130,6 @@ def test_derivatives_agree_with_central_differences(orthoglide):
         assert found.per_prior_std[along_x, i] == pytest.approx(expected_um, abs=1e-10)
 
 
-def test_all_readings_of_a_session(root):
-    plan = load_plan(root / "examples/workshop/plan.yaml")
-    study = build_sensitivity_study(plan)
-    table = run_study(study)
-    found = summarise_sensitivity(study, table)
-    assert len(found.parameters) == 129
-    assert sum(reads in plan.setups for _, reads in found.rows) == 18
-    assert len(table) == len(found.rows) * 129
-
-
 def test_points_without_contact(root):
     """The ball of a gauge is at a fixed place on the base."""
     plan = load_plan(root / "examples/workshop/plan.yaml")
@@ -152,8 +142,3 @@ def test_unreachable_points(orthoglide):
         build_sensitivity_study(orthoglide, points=[[0.5, 0.0, 0.0]])
     with pytest.raises(ClosureError, match="x_max"):
         build_sensitivity_study(orthoglide, displacements=Displacements(0.5, -0.1))
-
-
-def test_unknown_names(orthoglide):
-    with pytest.raises(ParameterError, match="nothing"):
-        build_sensitivity_study(orthoglide, ["nothing"])

@@ -6,13 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from commands import run_orthocal
-from linkages import (
-    joint,
-    write_ball_platform,
-    write_crooked_loop,
-    write_robot,
-    write_wide_linkage,
-)
+from conftest import ROOT
+from linkages import joint, write_ball_platform, write_crooked_loop, write_robot, write_wide_linkage
 from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
@@ -48,6 +43,8 @@ ROBOTS = {
     "universal": lambda folder: write_ball_platform(folder, "UJOINT_YX"),
     "loose": write_loose_loop,
     "open": write_open_arm,
+    "orthoglide": lambda _: "orthoglide",
+    "fivebar": lambda _: ROOT / "tests/robots/fivebar",
 }
 
 
@@ -67,7 +64,9 @@ def test_links_are_where_pinocchio_places_them(robot):
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.configuration(robot.reference_posture))
     drawn = {p.split("/")[1] for p in scene.nodes if p.startswith(f"{drawing.MACHINE}/")}
-    assert drawn == {f.name for f in robot.model.frames if f.type == pin.FrameType.BODY}
+    bodies = {f.name for f in robot.model.frames if f.type == pin.FrameType.BODY}
+    assert drawn == {v.link for v in load_visuals(robot)}
+    assert drawn == bodies or (robot.name == "orthoglide" and drawn < bodies)
     for link in drawn:
         expected = data.oMf[robot.frame_id(link)].homogeneous
         assert np.abs(scene.pose(f"{drawing.MACHINE}/{link}") - expected).max() < KINEMATICS

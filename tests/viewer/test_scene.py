@@ -150,16 +150,6 @@ def animation(scene):
 # ---- the machine
 
 
-def test_nominal_links_are_where_pinocchio_places_them(orthoglide):
-    scene = draw_scene(orthoglide)
-    zero = placed(orthoglide, orthoglide.drive_zero, orthoglide.reference_passive)
-    drawn = links(scene, drawing.MACHINE)
-    assert {"base", "x_slider", "y_rod_a", "z_rod_b", "platform"} <= drawn
-    for link in drawn:
-        pose = world(scene, f"{drawing.MACHINE}/{link}")
-        assert np.abs(pose - zero[link]).max() < KINEMATICS
-
-
 def test_true_scale_is_the_calibrated_machine_of_pinocchio(full, true_scale):
     """Calibrated links and ghost in a posture, with loops closed by Pinocchio."""
     posture = next(p for p in full.postures if p.name == "y_+60")
@@ -201,9 +191,7 @@ def test_deviation_is_enlarged_by_the_stated_factor(full, true_scale):
     assert max(moved) > 1e-3
 
 
-@pytest.mark.parametrize("name", [EXPERIMENT_2, "raw-cycles"])
-def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(name):
-    scene = scene_of(name)
+def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(scene):
     size = np.ptp(scene.camera.points, axis=0).max()
     fact = next(f for f in scene.facts if "largest" in f)
     largest = float(fact.split("largest ")[1].split(" mm")[0]) * 1e-3
@@ -221,21 +209,6 @@ def test_machine_without_deviation_needs_no_ghost(root):
     assert "No gauge shows a deviation" in scene.headline
 
 
-def test_active_offsets_move_the_ghost(root):
-    """The controller corrects its active offsets, so that the ghost is at the target."""
-    session = load_session(root / "examples/raw-cycles")
-    offsets = np.array([1e-3, -2e-3, 0.5e-3])
-    postures = {n: replace(p, drives=p.drives - offsets) for n, p in session.postures.items()}
-    active = replace(session, controller_offsets=offsets, postures=postures)
-    scene = draw_scene(calibrate(active, **UNJUDGED), posture="x_max")
-    robot = session.robot
-    drives = session.postures["x_max"].drives
-    passive = robot.close_with_pinocchio(drives, robot.reference_passive)
-    target = placed(robot, drives, passive)["platform"]
-    ghost = world(scene, f"{drawing.GHOST}/platform")
-    assert np.abs(ghost - target).max() < 1e-11
-
-
 def test_each_session_has_its_own_offsets(root):
     """The nominal machine of a joined calibration stands where its controller assumed it."""
     first = load_session(root / "examples/raw-cycles")
@@ -250,10 +223,12 @@ def test_each_session_has_its_own_offsets(root):
         target = drives + measured.active.get(name, measured.offsets)
         expected = first.postures[name.rpartition("/")[2]].drives
         assert target == pytest.approx(expected, abs=1e-12)
-    scene = draw_scene(joined, posture=next(iter(measured.drives)))
-    robot, drives = first.robot, next(iter(first.postures.values())).drives
+    robot, drives = first.robot, first.postures["x_max"].drives
     target = placed(robot, drives, robot.close_with_pinocchio(drives, robot.reference_passive))
-    assert np.abs(world(scene, f"{drawing.GHOST}/platform") - target["platform"]).max() < 1e-11
+    shown = [(joined, f"raw-cycles-{day}/x_max") for day in (1, 2)]
+    for subject, posture in (*shown, (identified(second), "x_max")):
+        ghost = world(draw_scene(subject, posture=posture), f"{drawing.GHOST}/platform")
+        assert np.abs(ghost - target["platform"]).max() < 1e-11
 
 
 def test_readings_of_several_approaches_are_not_averaged():
@@ -267,16 +242,6 @@ def test_readings_of_several_approaches_are_not_averaged():
     assert all(f"approach {r.approach}" in r.where for r in rows)
     assert max(r.cycles for r in rows) == max(
         Counter((r.setup, r.posture, r.approach) for r in session.readings).values()
-    )
-
-
-def test_leg_lines_go_from_root_to_tip(scene, calibration):
-    """Both ends of a leg line belong to drawn links."""
-    root = world(scene, f"{drawing.SOLID}/x_yoke")[:3, 3]
-    line = scene.pose(f"{machine_scene.LINES}/leg x")
-    assert line[:3, 3] == pytest.approx(root, abs=KINEMATICS)
-    assert np.linalg.norm(line[:3, 2]) == pytest.approx(
-        calibration.robot.legs["x"].length, abs=1e-3
     )
 
 
@@ -397,9 +362,6 @@ def test_scene_states_the_offsets_to_enter(scene, calibration):
     fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
     for entry in find_entries(calibration):
         assert f"{entry.drive} {entry.enter * 1e3:+.3f}".replace("-", "−") + " mm" in fact
-
-
-def test_scene_against_the_verdict_states_nothing_to_enter(calibration):
     decision = replace(calibration.assessment.decision, verdict="review")
     doubtful = replace(calibration, assessment=replace(calibration.assessment, decision=decision))
     assert not any("Offsets to enter" in fact for fact in draw_scene(doubtful).facts)
@@ -517,9 +479,9 @@ def test_arrows_follow_the_readings_of_every_posture():
     assert "leg y: xy" in step.caption
 
 
-def test_every_animated_node_is_one_that_is_drawn(scene):
-    for path in animation(scene):
-        assert any(n == path or n.startswith(f"{path}/") for n in scene.nodes), path
+def test_animation_and_legend_name_nodes_that_are_drawn(scene):
+    for node in {*animation(scene), *(n for entry in scene.legend for n in entry.nodes)}:
+        assert any(n == node or n.startswith(f"{node}/") for n in scene.nodes), node
 
 
 def test_many_postures_are_thinned_out_for_the_animation(monkeypatch):
@@ -569,14 +531,12 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     )
 
 
-def test_choice_of_what_is_shown_at_first(calibration, scene):
+def test_choice_of_what_is_shown_at_first(scene):
     assert hidden(scene) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNCERTAINTY}
     assert hidden(scene_of(EXPERIMENT_2, show="tool")) == {
         *(readings.GAUGES, readings.BEFORE, readings.AFTER)
     }
     assert hidden(scene_of(EXPERIMENT_2, show="all")) == set()
-    with pytest.raises(ParameterError, match="'everything' is none of readings, tool, all"):
-        draw_scene(calibration, show="everything")
 
 
 def test_a_name_like_an_identifier_is_kept():
@@ -592,25 +552,7 @@ def test_pose_of_a_missing_node_is_an_error(scene):
         scene.pose("Leg lines/leg w")
 
 
-def test_legend_names_existing_nodes(scene):
-    for entry in scene.legend:
-        for node in entry.nodes:
-            assert any(p.startswith(f"{node}/") for p in scene.nodes), node
-
-
 # ---- any robot
-
-
-def test_robots_without_visuals_are_drawn_as_sticks(fivebar):
-    robot = fivebar
-    scene = draw_scene(robot)
-    zero = placed(robot, robot.drive_zero, robot.reference_passive)
-    drawn = links(scene, drawing.MACHINE)
-    assert drawn == {*zero}
-    for link in drawn:
-        pose = world(scene, f"{drawing.MACHINE}/{link}")
-        assert np.abs(pose - zero[link]).max() < KINEMATICS
-    assert len(scene.steps) > 3
 
 
 def test_axes_are_in_view(root):
@@ -623,23 +565,23 @@ def test_axes_are_in_view(root):
     assert (points.max(axis=0) + 1e-4 >= np.max(names, axis=0)).all()
 
 
-def test_posture_must_be_one_of_the_session(calibration, orthoglide):
-    with pytest.raises(ParameterError, match=r"'x_mx' is not a posture; postures: x_max, x_min"):
-        draw_scene(calibration, posture="x_mx")
-    with pytest.raises(ParameterError, match="a robot has no postures"):
-        draw_scene(orthoglide, posture="zero")
-
-
-def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
-    for subject in (experiment_2, orthoglide):
-        with pytest.raises(ParameterError, match="applies to a calibration only"):
-            draw_scene(subject, exaggeration=2.0)
-
-
-@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
-def test_exaggeration_must_be_positive(calibration, factor):
-    with pytest.raises(ParameterError, match="expected a positive number"):
-        draw_scene(calibration, exaggeration=factor)
+@pytest.mark.parametrize(
+    ("subject", "options", "message"),
+    [
+        ("calibration", {"posture": "x_mx"}, "'x_mx' is not a posture; postures: x_max, x_min"),
+        ("orthoglide", {"posture": "zero"}, "a robot has no postures"),
+        ("experiment_2", {"exaggeration": 2.0}, "applies to a calibration only"),
+        ("orthoglide", {"exaggeration": 2.0}, "applies to a calibration only"),
+        ("calibration", {"exaggeration": 0.0}, "expected a positive number"),
+        ("calibration", {"exaggeration": -1.0}, "expected a positive number"),
+        ("calibration", {"exaggeration": np.nan}, "expected a positive number"),
+        ("calibration", {"exaggeration": np.inf}, "expected a positive number"),
+        ("calibration", {"show": "everything"}, "'everything' is none of readings, tool, all"),
+    ],
+)
+def test_invalid_options_are_refused(request, subject, options, message):
+    with pytest.raises(ParameterError, match=message):
+        draw_scene(request.getfixturevalue(subject), **options)
 
 
 def test_the_stated_largest_exaggeration_is_possible(calibration):
@@ -729,15 +671,7 @@ def test_names_from_files_stay_in_the_data(raw_cycles):
 
 @pytest.mark.parametrize(
     ("value", "rounded"),
-    [
-        (0.3, 1.0),
-        (1.0, 1.0),
-        (1.19, 1.0),
-        (13.0, 12.0),
-        (99.0, 80.0),
-        (250.0, 250.0),
-        (np.inf, 1.0),
-    ],
+    [(0.3, 1.0), (1.19, 1.0), (13.0, 12.0), (99.0, 80.0), (250.0, 250.0), (np.inf, 1.0)],
 )
 def test_scales_are_round_and_never_too_large(value, rounded):
     assert round_scale(value) == rounded
