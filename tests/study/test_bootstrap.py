@@ -122,9 +122,20 @@ def test_model_std_includes_the_prior(root):
     assert all(p.predicted < p.model_std for p in found.parameters)
 
 
-def test_session_without_residuals(root):
+def test_rescaled_residuals_have_the_size_of_the_noise(many_cycles):
+    prepared = build_bootstrap_study(many_cycles, "offsets", draws=2).prepare()
+    sigma = many_cycles.gauge.sigma
+    resolution = many_cycles.gauge.resolution or 0.0
+    expected = np.hypot(sigma, resolution / np.sqrt(12))
+    assert prepared.residuals.std() == pytest.approx(expected, rel=0.08)
+    assert abs(prepared.residuals.mean()) < 1e-18
+
+
+def test_session_without_residuals_or_cycles(root):
     with pytest.raises(SessionError, match="has no residuals to resample"):
         build_bootstrap_study(load_session(root / "examples/workshop"), "full")
+    with pytest.raises(SessionError, match=r"setups\.\w+: has one cycle of readings"):
+        build_bootstrap_study(load_session(root / "examples/workshop"), "offsets", by="cycles")
 
 
 def test_cycles_with_different_postures(raw_cycles):

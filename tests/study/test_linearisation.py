@@ -6,6 +6,7 @@ import closed_form
 import numpy as np
 import pytest
 from gauges import exact, with_gauges
+from tolerances import THREE_DECIMALS_MM
 
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
@@ -42,6 +43,12 @@ def summary(study):
 
 def method(summary, name):
     return next(m for m in summary.methods if m.name == name)
+
+
+def test_linearisation_errors_of_readings(orthoglide):
+    study = build_linearisation_study(orthoglide, sizes=[1.0, 2.0, 5.0], along=ALONG)
+    found = run_task(study, 0)["reading_mm"]
+    assert np.abs(np.array(found) - [0.0015, 0.006, 0.039]).max() * 1e-3 < THREE_DECIMALS_MM
 
 
 def test_linearisation_errors_agree_with_the_closed_forms(orthoglide):
@@ -226,3 +233,15 @@ def test_the_last_size_is_the_largest(orthoglide, count):
     assert len(sizes) == count
     assert sizes[-1] == 17.61
     assert count == 1 or sizes[0] == 0.1
+
+
+def test_paper_plan_requires_an_orthoglide(biglide):
+    with pytest.raises(ParameterError, match="has no legs x, y, z along these axes"):
+        build_linearisation_study(biglide)
+
+
+def test_noise_and_resolution_of_the_gauge(orthoglide):
+    study = build_linearisation_study(orthoglide, gauge=Gauge(1e-6, 2e-6, None))
+    assert study.resolution == 2e-6
+    assert study.sigma == pytest.approx(np.hypot(1e-6, 2e-6 / np.sqrt(12)))
+    assert exact(study.session).setups.keys() == study.session.setups.keys()
