@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED
+from calibrated import EXPERIMENT_2, calibrated, identified
 from commands import run_orthocal
 from effect_plans import effect_plan
 
-from orthocal import assess_tool, calibrate, simulate_session
+from orthocal import assess_tool, simulate_session
 from orthocal.assessment import tool_tables as module
 from orthocal.assessment.tool_error import Workspace
 from orthocal.assessment.tool_tables import (
@@ -31,8 +31,8 @@ BEYOND_TRAVEL = [0.1, 0.0, 0.0]
 
 
 @pytest.fixture(scope="module")
-def calibration(experiment_2):
-    return calibrate(experiment_2, **UNJUDGED)
+def calibration():
+    return calibrated(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def compensated():
     trims = tuple(JointTrim(amount) for amount in (0.1e-3, 0.06e-3, 0.02e-3))
     plan = replace(effect_plan("backlash"), compensation=trims)
     errors = {"x_slide.backlash": 0.03e-3, "y_slide.offset": 0.2e-3}
-    return calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
+    return identified(simulate_session(plan, errors, seed=1).session, "full")
 
 
 @pytest.fixture(autouse=True)
@@ -154,10 +154,10 @@ def test_a_table_of_which_no_row_can_be_reached_is_bad_input(orthocal):
 
 def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
     """What is held is a chunk and the rows themselves."""
-    monkeypatch.setattr(module, "CHUNK_SIZE", 100)
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (1000, 3))
+    monkeypatch.setattr(module, "CHUNK_SIZE", 40)
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (400, 3))
     peaks = []
-    for count in (100, 1000):
+    for count in (40, 400):
         tracemalloc.start()
         for _ in accuracy_rows(calibration, points[:count]):
             pass

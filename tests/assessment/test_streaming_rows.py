@@ -7,10 +7,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED
+from calibrated import EXPERIMENT_2, calibrated
 from commands import run_orthocal
 
-from orthocal import calibrate
+from orthocal.assessment.tool_tables import inverse_blocks
 from orthocal.calibration.file import write_calibration
 from orthocal.cli import printing
 from orthocal.errors import SessionError
@@ -22,11 +22,9 @@ HEADER = "x_mm,y_mm,z_mm\n"
 
 
 @pytest.fixture(scope="module")
-def folder(experiment_2, tmp_path_factory):
+def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("calibration")
-    calibration = calibrate(experiment_2, **UNJUDGED)
-    write_calibration(calibration, path / "calibration.json")
-    return path
+    return write_calibration(calibrated(EXPERIMENT_2), path / "calibration.json").parent
 
 
 @pytest.fixture
@@ -103,13 +101,10 @@ def test_text_that_is_none_is_named_by_its_byte():
         list(read_lines(io.BytesIO(content), longest=100, name="t", error=SessionError))
 
 
-def test_memory_does_not_grow_with_the_stream(folder, orthoglide, monkeypatch):
+def test_memory_does_not_grow_with_the_stream(monkeypatch):
     """Reading, evaluating and printing a long pipe, whose lines are made as they are read."""
-    from orthocal.assessment.tool_tables import inverse_blocks
-    from orthocal.calibration.file import load_calibration
-
     monkeypatch.setattr(table, "BLOCK_ROWS", 50)
-    calibration = load_calibration(folder)
+    calibration = calibrated(EXPERIMENT_2)
 
     class Pipe(io.RawIOBase):
         def __init__(self, count):
@@ -122,7 +117,7 @@ def test_memory_does_not_grow_with_the_stream(folder, orthoglide, monkeypatch):
             return next(self.lines, b"")
 
     peaks = []
-    for count in (200, 2000):
+    for count in (100, 1000):
         pipe = Pipe(count)
         tracemalloc.start()
         blocks = table.stream_points(pipe, calibration.robot, name="p")

@@ -126,6 +126,9 @@ def test_an_answer_is_short_in_order_and_states_all_that_decides(answers, name):
     assert_order(calibration, text, leg="250" if name == "250 mm" else "310.25")
     assert_findings(calibration.assessment, text, details)
     assert_tool_error(calibration, text, details)
+    if name == "no offset":
+        (note,) = calibration.assessment.of_kind("no offset")
+        assert (note.severity, calibration.assessment.decision.verdict) == ("note", "enter")
 
 
 def assert_short(calibration):
@@ -177,6 +180,7 @@ def assert_tool_error(calibration, text, details):
     """In one sentence everywhere: the short answer, the section of the tool and the findings."""
     found = calibration.assessment
     if found.tool is None:
+        assert found.decision.verdict == "enter"
         assert found.of_kind("out of reach")[0].text in text
         return
     sentence = describe_tool_error(found.tool, keep=found.keeps_offsets)

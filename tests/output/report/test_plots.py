@@ -172,10 +172,6 @@ def test_ids_do_not_collide_on_one_page_and_all_references_are_kept(drawn):
         assert set(used) <= set(ids)
 
 
-def test_the_same_calibration_makes_the_same_plots(table1, drawn):
-    assert [plot(table1) for plot in PLOTS[::3]] == drawn[: len(PLOTS) : 3]
-
-
 def test_settings_of_matplotlib_are_neither_used_nor_changed(table1):
     usual = reading_plots.plot_residuals(table1)
     with matplotlib.rc_context({"font.size": 20.0, "svg.fonttype": "path", "axes.grid": True}):
