@@ -33,13 +33,7 @@ from orthocal.assessment import judgement as judgement_module
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.wording import describe_actions, parameter_places, review
-from orthocal.calibration.assessment_record import (
-    EXIT_CODES,
-    Finding,
-    FindingKind,
-    Place,
-    Severity,
-)
+from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Place, Severity
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.measurement.joining import join_sessions
@@ -112,7 +106,7 @@ def cases(cycles, table1):
     backlash = simulate_session(sided_plan(FEW), errors, seed=4).session
     coarse = replace(cycles.gauge, resolution=10e-3)
     return {
-        "sound": cycles,
+        "sound": table1["2"],
         "experiment 1 as printed": table1["1-printed"],
         "reversed sign": change(cycles, largest, -cycles.values[largest]),
         "inches": cycles.with_values(np.round(cycles.values / 25.4, 7)),

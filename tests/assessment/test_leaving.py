@@ -50,13 +50,12 @@ def test_the_tool_error_decides_not_significance(number):
     calibration = calibrated(f"table1/experiment-{number}")
     found = calibration.assessment
     accuracy = assess_placed(
-        calibration,
-        find_tool(calibration),
-        [replace(e, enter=e.best) for e in found.entries],
+        calibration, find_tool(calibration), [replace(e, enter=e.best) for e in found.entries]
     )
     best = summarise_tool(calibration, accuracy).entered
     assert best < found.tool.now
     assert found.keeps_offsets is (number == 3) is (best > (1.0 - WORTH_ENTERING) * found.tool.now)
+    assert not (found.keeps_offsets and found.of_kind("must change"))
     assert sum(is_significant(calibration, e) for e in found.entries) < 2
 
 
