@@ -198,12 +198,11 @@ def test_adjustments_are_planned_if_no_offset_is_identified(plan):
 def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     errors = {"x_slide.offset": 0.4e-3, "y_slide.rz": 1.4e-3}
     session = simulate_session(plan, errors, seed=1, sigma=3e-6).session
-    write_calibration(calibrate(session, **UNJUDGED), tmp_path / "calibration.json")
-    code, out, _ = run("adjust", tmp_path, "--json")
-    document = json.loads(out)
-    assert (document["worthwhile"], document["judgement"]) == (False, "small gain")
-    amounts = {a["name"]: a["amount"] for a in document["adjustments"]}
-    assert amounts
+    calibration = calibrate(session, **UNJUDGED)
+    write_calibration(calibration, tmp_path / "calibration.json")
+    planned = plan_adjustments(calibration)
+    assert planned.judgement == "small gain"
+    assert planned.amounts
     new = tmp_path / "new"
     words = ("again", tmp_path, "--adjusted", "plan", "--out", new)
     code, out, err = run(*words)
@@ -213,7 +212,7 @@ def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     assert not new.exists()
     code, out, _ = run(*words, "--anyway")
     assert code == 0
-    assert all(name in (new / "session.yaml").read_text() for name in amounts)
+    assert all(name in (new / "session.yaml").read_text() for name in planned.amounts)
 
 
 def test_adjustments_with_uncertain_gain_are_details(planned):

@@ -68,6 +68,11 @@ def files(small):
     return sheet_files(small)
 
 
+def page_of(plan):
+    """The sheet of a plan, parsed."""
+    return etree.HTML(sheet_files(plan)["sheet.html"])
+
+
 @pytest.fixture(scope="module")
 def page(files):
     return etree.HTML(files["sheet.html"])
@@ -131,8 +136,8 @@ def test_stated_contact_is_on_the_rod(small, page):
 def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
     """On the centre line of leg x, which is 125 mm from the slide in the mechanical zero."""
     setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="<out>")}
-    page = etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"])
-    text = next(words(s) for s in sections(page) if words(s.find("h2")).endswith(": zx"))
+    found = sections(page_of(replace(small, setups=setups)))
+    text = next(words(s) for s in found if words(s.find("h2")).endswith(": zx"))
     drives = small.postures["<out>"].drives
     root, tip, tool = (
         place(small.robot, drives, frame) for frame in ("x_leg_root", "x_leg_tip", "tcp")
@@ -150,7 +155,7 @@ def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod and hinge."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
     session = replace(small, readings=tuple(readings))
-    text = words(sections(etree.HTML(sheet_files(session)["sheet.html"]))[0])
+    text = words(sections(page_of(session))[0])
     robot = small.robot
     drives = small.postures["<out>"].drives
     root, tip = (place(robot, drives, f) for f in ("x_bar_a", "x_coupler"))
@@ -175,7 +180,7 @@ def test_alignment_posture_comes_before_the_first(small):
     setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="in&")}
     (section,) = [
         s
-        for s in sections(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]))
+        for s in sections(page_of(replace(small, setups=setups)))
         if words(s.find("h2")).endswith(": zx")
     ]
     steps = [words(li) for li in section.xpath(".//ol/li")]
@@ -183,7 +188,7 @@ def test_alignment_posture_comes_before_the_first(small):
     assert steps[0].startswith(f"Move to the alignment posture, in&: x_slide {joints[0]} mm")
     assert steps[3].startswith("Move to the first posture, zero: x_slide 0.000 mm")
     assert "gauge zero" in steps[4]
-    section = sections(etree.HTML(sheet_files(small)["sheet.html"]))[2]
+    section = sections(page_of(small))[2]
     steps = [words(li) for li in section.xpath(".//ol/li")]
     assert steps[0].startswith("Move to the alignment posture, which is also the first posture")
     assert "gauge zero" in steps[3]
@@ -313,7 +318,7 @@ def test_tip_near_a_hinge_causes_a_warning(small):
     sensor = small.setups["xy"].sensor
     near = replace(sensor, section=replace(sensor.section, value=0.99))
     setups = {**small.setups, "xy": replace(small.setups["xy"], sensor=near)}
-    text = words(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]).find("body"))
+    text = words(page_of(replace(small, setups=setups)).find("body"))
     assert text.count("of the middle of a hinge") == 1
 
 
@@ -323,7 +328,7 @@ def test_a_gauge_between_two_rods_causes_a_warning(small):
     for direction, between in (("y", False), ("z", False), ("-z", True)):
         sensor = replace(setup.sensor, direction=direction)
         plan = replace(small, setups={**small.setups, "<b>yx": replace(setup, sensor=sensor)})
-        section = sections(etree.HTML(sheet_files(plan)["sheet.html"]))[0]
+        section = sections(page_of(plan))[0]
         warning = "between rods a and b, with 52 mm for dial and plunger"
         assert (warning in words(section)) is between
         assert ("touch rod b instead" in words(section)) is between
@@ -345,7 +350,7 @@ def test_a_machine_with_cranks_is_described_without_slides(root, tmp_path):
         "setups: {up: {leg: left, touches: a, tip: {ball: {radius_mm: 1.5}}, "
         "direction: [0, 0, 1], section: {fraction: 0.5}}}\n"
     )
-    text = words(etree.HTML(sheet_files(load_plan(tmp_path / "plan.yaml"))["sheet.html"]))
+    text = words(page_of(load_plan(tmp_path / "plan.yaml")))
     assert "Jog each joint a little counterclockwise as seen from +z. Its number must grow" in text
     assert "leg left, gauge in z, at 0.5 of its length from the crank at the mechanical" in text
     assert "100.0 mm from the hinge on the crank" in text
