@@ -125,11 +125,11 @@ def test_an_assumed_line_is_named_where_it_matters(root, raw_cycles):
     assert f"`touches: {found.touches}`" in assumed.action
     coarse = raw_cycles.with_values(raw_cycles.values)
     coarse = coarse.with_gauge(type(coarse.gauge)(0.5 * MM, 0.01 * MM, None))
-    assert not calibrate(coarse, **UNJUDGED).assessment.of_kind("line assumed")
+    assert not _line_model_error(identified(coarse))
     plan = load_plan(root / "examples/workshop/plan.yaml")
     on_rods = simulate_session(plan, {}, seed=0).session
     assert find_line_model_error(on_rods, {}) is None
-    assert not calibrate(on_rods, "offsets", **UNJUDGED).assessment.of_kind("line assumed")
+    assert not _line_model_error(identified(on_rods, "offsets"))
 
 
 def test_the_rod_that_deviates_most_is_reported():

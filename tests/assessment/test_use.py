@@ -398,7 +398,6 @@ def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, cali
     assert any("controller must compensate the backlash" in c for c in at_34)
     # with the values to enter, the controller compensates the backlash, unless it cannot
     for options, part in (
-        (active, "must not"),
         ((), "must compensate"),
         (("--backlash", "program"), "must not"),
     ):

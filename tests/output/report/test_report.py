@@ -254,7 +254,7 @@ def test_report_without_prediction_and_noise(raw_cycles):
 
 def test_robot_without_a_tool_has_a_report(experiment_2):
     bare = replace(experiment_2.robot, tcp=None)
-    page = build_short_report(identified(replace(experiment_2, robot=bare)))
+    page = build_short_report(calibrate(replace(experiment_2, robot=bare), **UNJUDGED))
     assert "The tool error cannot be computed" in page
     assert "no tool centre point" in page
 

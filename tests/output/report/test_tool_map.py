@@ -32,8 +32,6 @@ BETWEEN = 1e-3
 CONTOUR = 0.2
 """[mm] Contours of a length between points of the drawn grid, 3 mm apart."""
 
-WHICH = ("now", "entered", "uncertainty")
-
 
 @pytest.fixture(scope="module")
 def table1(experiment_2):
@@ -65,7 +63,8 @@ def planar(root, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def maps(table1, accuracy):
-    return {which: tool_map.plot_tool_map(table1, accuracy, which=which) for which in WHICH}
+    kinds = ("now", "uncertainty")
+    return {which: tool_map.plot_tool_map(table1, accuracy, which=which) for which in kinds}
 
 
 def draw(calibration, accuracy, which):
@@ -148,22 +147,6 @@ def test_the_scale_of_the_tolerances_is_stated():
     shown = drawn_texts(draw(calibration, assess_tool(calibration), "uncertainty"))
     excess = calibration.tolerance_scale.factor
     assert f"RMS uncertainty in space [µm], tolerances × {excess:.1f}" in shown
-
-
-def test_the_map_goes_through_the_points_of_the_grid(table1, accuracy):
-    lines = tool_map._find_grid(accuracy.workspace.points)
-    grid = tool_map._error_parts(accuracy, "now").reshape(5, 5, 5, 3)
-    cut = tool_map._cut(grid, (0, 2))
-    np.testing.assert_array_equal(cut, grid[:, 2, :])
-    sides = [lines[0], lines[2]]
-    between = tool_map._interpolate(sides, cut)
-    np.testing.assert_allclose(np.moveaxis(between(*sides), 0, -1), cut, atol=GRID)
-    x, y, size = tool_map._refine(sides, between)
-    for found, line in ((x, lines[0]), (y, lines[2])):
-        np.testing.assert_allclose(found, np.linspace(line[0], line[-1], 43) * 1e3, atol=GRID)
-    for i, j in ((0, 0), (0, 21), (21, 21), (42, 0)):  # corners and middles are in both
-        at = cut[i * 4 // 42, j * 4 // 42]
-        assert abs(size[j, i] - np.linalg.norm(at)) < GRID
 
 
 def test_the_map_between_its_points_is_that_of_the_machine(table1, accuracy):
