@@ -207,10 +207,29 @@ def plans_of_few_candidates():
         yield
 
 
+@contextmanager
+def few_tool_points():
+    """Tool errors over 27 points instead of 125 under several conditions of use."""
+    from orthocal.assessment import calibrated_tool
+    from orthocal.kinematics.conditions import sample_use
+    from orthocal.kinematics.workspace import box_workspace
+
+    def find_few(robot, require_reach=None):
+        found = find_workspace(robot, require_reach)
+        if sample_use(robot).size == 1:
+            return found
+        return box_workspace(robot, found.limits, points_per_side=3)
+
+    find_workspace = calibrated_tool.find_workspace
+    with patch.object(calibrated_tool, "find_workspace", find_few):
+        yield
+
+
 judged_sessions = module_fixture(judged_once)
 quick_plans = module_fixture(plans_of_few_candidates)
 without_sensor_gains = pytest.fixture(no_sensor_gains.__wrapped__)
 module_without_sensor_gains = module_fixture(no_sensor_gains)
+module_of_few_tool_points = module_fixture(few_tool_points)
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,14 @@ import atexit
 import os
 import shutil
 import tempfile
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
 
 from orthocal import load_plan
 from orthocal.robot.loading import packaged_robots
+from orthocal.session.session import Conditions
 
 EFFECTS = "backlash: {}, thermal: {}, screw: {lead_mm: 10}, drift: {}"
 """Keys of all effects that a session can identify."""
@@ -90,3 +92,14 @@ def effect_plan(*chosen, keys=EFFECTS, setups=None):
     if setups is None:
         return plan
     return plan.select([r for r in plan.readings if r.setup in setups])
+
+
+@cache
+def sided_plan(setups=None):
+    """`effect_plan` with backlash whose readings state their side of approach alone.
+
+    No other effect is in question, which halves the time of a judgement.
+    """
+    plan = effect_plan("backlash", setups=setups)
+    readings = [replace(r, conditions=Conditions(r.approach)) for r in plan.readings]
+    return replace(plan, readings=tuple(readings))

@@ -1,4 +1,4 @@
-"""Tool error: sensitivities, means over a workspace, and figures of three plans."""
+"""Tool error: sensitivities, means over a workspace, figures of plans, and known machines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibrated import UNJUDGED, identified, plan_of, session_of
 from closed_form import inverse
 from derivatives import assert_derivative
 from gauges import exact
-from machines import place, write_orthoglide
+from machines import place, reading_by_pinocchio, write_orthoglide
 from models import JOINTS
 
 from orthocal import (
@@ -32,10 +32,13 @@ from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import assess_tool, measure_deviations, measure_uncertainty
 from orthocal.builder.build import make_robot
 from orthocal.builder.orthoglide import Orthoglide
+from orthocal.calibration.build_record import assemble_calibration
 from orthocal.errors import RobotError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.export.formats import export_corrections
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
@@ -45,10 +48,13 @@ from orthocal.kinematics.workspace import Workspace, cube, tool_at_zero
 from orthocal.output.text.accuracy import accuracy_json
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.first_plan import paper_plan
+from orthocal.sensors.mounting import Mounting
+from orthocal.session.session import Gauge
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 
 OFFSET_SIGMA = 2e-3
+OFFSET_STD = {"*.offset": OFFSET_SIGMA}
 FAST = SolverOptions("variable-projection")
 
 TABLE = [
@@ -339,8 +345,176 @@ def test_figures_at_the_tool_are_those_of_the_stated_workspace(tmp_path):
     )
     assert table[:, :3].min(axis=0) == pytest.approx(box[:, 0] * 1e3)
     assert table[:, :3].max(axis=0) == pytest.approx(box[:, 1] * 1e3)
-    module = approximate(result, within=1e-5)
+    module = approximate(result, within=1e-4)
     assert (module.inverse.lower, module.inverse.upper) == (
         pytest.approx(box[:, 0]),
         pytest.approx(box[:, 1]),
     )
+
+
+SIGMA = 5e-6
+AGREED = 0.03
+
+
+def with_mounting(plan, mounting):
+    setups = {
+        name: replace(s, sensor=replace(s.sensor, mounting=mounting))
+        for name, s in plan.setups.items()
+    }
+    return replace(plan, setups=setups)
+
+
+def once(plan):
+    first = {(r.setup, r.posture): r for r in reversed(plan.readings)}
+    return replace(plan, readings=tuple(r for r in plan.readings if r in first.values()))
+
+
+def bound(plan, workspace, *, sigma, free):
+    """RMS tool error of the posterior without translation, and also without rotation, [µm]."""
+    robot = plan.robot
+    names = robot.parameters.select(free)
+    problem = build_problem(plan, free=names, prior=True, prior_stds=OFFSET_STD)
+    n = problem.n_machine
+    tool = ToolSensitivity(robot, free=problem.free[:n])(
+        LoopClosure(robot).inverse(workspace.points)
+    )
+    _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
+    posterior = (
+        decompose(slopes, problem.observations)
+        .posterior(sigma=sigma, precision=problem.prior_precision)
+        .covariance
+    )
+    scale = problem.theta_scale[:n]
+    covariance = posterior[:n, :n] * np.outer(scale, scale)
+    sizes = measure_uncertainty(tool, covariance, workspace, workspace.points).sizes
+    return 1e6 * sizes.relative.rms, 1e6 * sizes.aligned.rms
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma", "joints", "complete"),
+    [("raw-cycles", 5e-6, (63.0, 12.2), 14.8), ("lines", 10e-6, (58.0, 10.1), 12.9)],
+)
+def test_bounds_are_those_of_the_design(workspace, name, sigma, joints, complete):
+    plan = once(plan_of(name))
+    translated, aligned = bound(plan, workspace, sigma=sigma, free=JOINTS)
+    assert translated == pytest.approx(joints[0], rel=AGREED)
+    assert aligned == pytest.approx(joints[1], rel=AGREED)
+    _, aligned = bound(
+        plan, workspace, sigma=sigma, free=plan.robot.parameters.select_model("full")
+    )
+    assert aligned == pytest.approx(complete, rel=AGREED)
+
+
+@pytest.mark.parametrize(("roll", "expected"), [(0.2e-3, 14.8), (5e-3, 50.3)])
+def test_squareness_from_lines_depends_on_the_direction_of_the_gauge(
+    workspace, monkeypatch, roll, expected
+):
+    """Roll alone: the figures do not include the pitch of an edge, which adds 1 to 5 %."""
+    plan = with_mounting(plan_of("lines"), Mounting(roll, 0.0, 0.0, 0.0))
+    nuisance_parameters = Mounting.nuisance_parameters
+    monkeypatch.setattr(
+        Mounting,
+        "nuisance_parameters",
+        lambda self, *, ball: tuple(
+            p for p in nuisance_parameters(self, ball=ball) if p.name == "roll"
+        ),
+    )
+    translated, _ = bound(plan, workspace, sigma=SIGMA, free=JOINTS)
+    assert translated == pytest.approx(expected, rel=AGREED)
+
+
+def test_errors_outside_the_complete_model_change_nothing(workspace, orthoglide):
+    """The tool error of all 177 errors is that of the 129 of the complete model."""
+    plan = once(plan_of("raw-cycles"))
+    p = orthoglide.parameters
+    assert bound(plan, workspace, sigma=SIGMA, free=p.of_parts) == pytest.approx(
+        bound(plan, workspace, sigma=SIGMA, free=p.complete), rel=1e-6
+    )
+
+
+EXACT_SIGMA = 3e-8
+"""Stated noise of exact readings, [m]."""
+
+OFFSETS = {"*.offset_mm": 4.0}
+
+MACHINES = 40
+"""The sweep leaves a few directions undetermined: the RMS error of 40 machines scatters by 9 %.
+That of 200 machines is 1.03 of the predicted one, with the lines 0.98."""
+
+
+class Machines:
+    """A plan with exact gauges, the problem of all errors, and the tool of machines."""
+
+    def __init__(self, name):
+        self.name, self.plan = name, exact(plan_of(name))
+        self.problem = build_problem(self.plan, free=JOINTS, prior=True, prior_stds=OFFSET_STD)
+        self.workspace = cube(self.plan.robot, points_per_side=5)
+        self.drives = LoopClosure(self.plan.robot).inverse(self.workspace.points)
+        self.closure = LoopClosure(self.plan.robot, free=self.problem.free)
+
+    def draw(self, seed):
+        """Errors of a machine, shape (n_free,), [SI]."""
+        names = self.problem.machine_selection.names
+        errors = draw_errors(self.plan.robot, names, seed=seed, tolerances=OFFSETS)
+        return np.array([errors[n] for n in self.problem.free])
+
+    def tool(self, theta):
+        """Positions of the tool over the workspace less their mean, shape (..., K, 3), [m]."""
+        return self.workspace.remove_translation(self.closure.forward(self.drives, theta=theta))
+
+
+@pytest.fixture(scope="module", params=["sweep", "lines"])
+def machines(request):
+    return Machines(request.param)
+
+
+@pytest.mark.slow
+def test_the_tool_error_of_machines_is_the_predicted_one():
+    """Machines with all errors at tolerance, offsets of 2 mm, readings of 5 µm."""
+    m, rng = Machines("sweep"), np.random.default_rng(0)
+    truths = np.array([m.draw(100 + seed) for seed in range(MACHINES)])
+    values, _, reached = m.problem.simulate(truths)
+    assert reached.all()
+    measured = values + SIGMA * rng.normal(size=values.shape)
+    found = BatchSolver(m.problem).solve(measured, sigma=SIGMA).theta
+    errors = [m.tool(one) - m.tool(truth) for one, truth in zip(found, truths, strict=True)]
+    squares = [m.workspace.weights @ (e**2).sum(axis=1) for e in errors]
+    predicted, _ = bound(m.plan, m.workspace, sigma=SIGMA, free=JOINTS)
+    assert 0.85 < 1e6 * np.sqrt(np.mean(squares)) / predicted < 1.15
+
+
+def test_exact_readings_give_the_tool_where_they_determine_it(machines):
+    """Points and directions whose posterior is below 0.3 µm are right to 1 µm."""
+    m, problem = machines, machines.problem
+    truth = m.draw(7)
+    plan = m.plan.with_gauge(Gauge(EXACT_SIGMA, None, None))  # without rounding
+    session = plan.with_values(problem.observations.rows(problem.predict(truth)))
+    again = build_problem(session, free=JOINTS, prior=True, prior_stds=OFFSET_STD)
+    fit = fit_problem(again, options=FAST)
+    accuracy = assess_tool(assemble_calibration(fit), m.workspace)
+    error = m.tool(fit.solution.theta) - m.tool(truth)
+    jacobian = m.workspace.remove_translation(accuracy.jacobian)[:, :, : problem.n_free]
+    posterior = jacobian @ fit.covariance() @ jacobian.transpose(0, 2, 1)
+    spread = np.sqrt(np.diagonal(posterior, axis1=1, axis2=2))
+    determined = spread < 0.3e-6
+    assert np.abs(error)[determined].max() < 1e-6
+    if m.name == "lines":  # only the common translation is undetermined
+        assert determined.all()
+    else:  # the sweep determines the tool near the axes
+        assert 0 < determined.sum() < 0.1 * determined.size
+        assert np.abs(error)[~determined].max() > 10e-6
+
+
+def test_pinocchio_reproduces_predicted_readings_and_tool():
+    """All errors of the model in a pin.Model, to 1e-9 m."""
+    session = exact(session_of("sweep"))
+    result = identified(session, Choice("full", tolerances=OFFSETS))
+    machine = session.robot.with_errors(result.errors)
+    zeros = {s.name: s.zero for s in result.setups}
+    for row in result.residuals[::6]:
+        setup, posture = session.setups[row.setup], session.postures[row.posture]
+        shown = reading_by_pinocchio(session, machine, setup, posture) + zeros[row.setup]
+        assert shown == pytest.approx(row.predicted, abs=1e-9)
+    for p in list(session.postures.values())[::5]:
+        tool = place(machine, p.drives, "tcp")
+        assert np.abs(result.machine.forward(p.drives) - tool).max() < 1e-9

@@ -19,20 +19,24 @@ from orthocal import (
     draw_errors,
     plan_adjustments,
     simulate_session,
-    validate_calibration,
     write_calibration,
 )
 from orthocal.assessment.adjustment_plan import LEAST_GAIN, _Search
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.assessment.predictive import judge_deviations
 from orthocal.assessment.tool_error import measure_deviations
+from orthocal.assessment.validation import _apply_stated
 from orthocal.assessment.words.adjustment import HEADLINES
 from orthocal.calibration.build_record import adjust_calibration
+from orthocal.calibration.refit import repeat_fit
+from orthocal.cli.again import _read_amounts
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.errors import ParameterError, RobotError
 from orthocal.output.report.page import build_report
 from orthocal.output.text.adjustment import render_plan
 from orthocal.output.text.layout import to_text
+from orthocal.statistics.chance import BY_CHANCE
 
 SEED = 8
 
@@ -194,12 +198,11 @@ def test_adjustments_are_planned_if_no_offset_is_identified(plan):
 def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     errors = {"x_slide.offset": 0.4e-3, "y_slide.rz": 1.4e-3}
     session = simulate_session(plan, errors, seed=1, sigma=3e-6).session
-    write_calibration(calibrate(session, **UNJUDGED), tmp_path / "calibration.json")
-    code, out, _ = run("adjust", tmp_path, "--json")
-    document = json.loads(out)
-    assert (document["worthwhile"], document["judgement"]) == (False, "small gain")
-    amounts = {a["name"]: a["amount"] for a in document["adjustments"]}
-    assert amounts
+    calibration = calibrate(session, **UNJUDGED)
+    write_calibration(calibration, tmp_path / "calibration.json")
+    planned = plan_adjustments(calibration)
+    assert planned.judgement == "small gain"
+    assert planned.amounts
     new = tmp_path / "new"
     words = ("again", tmp_path, "--adjusted", "plan", "--out", new)
     code, out, err = run(*words)
@@ -209,7 +212,7 @@ def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     assert not new.exists()
     code, out, _ = run(*words, "--anyway")
     assert code == 0
-    assert all(name in (new / "session.yaml").read_text() for name in amounts)
+    assert all(name in (new / "session.yaml").read_text() for name in planned.amounts)
 
 
 def test_adjustments_with_uncertain_gain_are_details(planned):
@@ -248,8 +251,10 @@ def test_validation_expects_the_adjusted_machine(plan, machine, planned):
     entered = plan.with_controller(offsets_to_enter(adjusted))
     now = {**errors, **{f"{n}.adjustment": v for n, v in amounts.items()}}
     after = simulate_session(entered, now, seed=12, sigma=3e-6).session
-    validation = validate_calibration(calibration, replace(after, adjusted=amounts))
-    assert validation.confirmed is True
+    for stated, expected in ((amounts, True), ({}, False)):
+        before, (new,) = _apply_stated(calibration, [replace(after, adjusted=stated)], {})
+        test = judge_deviations(before, repeat_fit(before, new))
+        assert (test.p_value > BY_CHANCE) is expected
 
 
 @pytest.mark.usefixtures("short_reports", "without_sensor_gains")
@@ -269,16 +274,10 @@ def test_command_and_report_list_the_planned_adjustments(calibration, tmp_path):
     assert "--among" in err
     new = tmp_path / "new"
     foot = "x_side_foot_z"
-    texts = []
-    for words in ((), ("--adjusted", f"{foot}=0")):  # by nothing
-        code, out, _ = run("again", tmp_path, *words, "--out", new, "--force")
-        assert code == 0
-        texts.append((out, (new / "session.yaml").read_text()))
-    assert texts[0] == texts[1]
+    assert _read_amounts(calibration, f"{foot}=0", anyway=False) == {}
     for amounts in (foot, "w_foot=1", f"{foot}=99", f"{foot}=.1,{foot}=.1"):
-        code, _, err = run("again", tmp_path, "--adjusted", amounts, "--out", new, "--force")
-        assert code == 2
-        assert "--adjusted" in err
+        with pytest.raises(ParameterError, match="--adjusted"):
+            _read_amounts(calibration, amounts, anyway=False)
     code, out, _ = run("again", tmp_path, "--adjusted", f"{names[0]}=0.12", "--out", new, "--force")
     assert code == 0
     assert "Do not type them as HOME_OFFSET: it changes by " in out

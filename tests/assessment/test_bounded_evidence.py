@@ -16,10 +16,7 @@ from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import build_likelihood
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.hypotheses.linearisation import ModelLinearisation
-from orthocal.statistics.distributions import (
-    log_positive_share,
-    log_positive_share_of_independent,
-)
+from orthocal.statistics.distributions import log_positive_share, log_positive_share_of_independent
 
 DRAWS = 200_000
 

@@ -25,6 +25,8 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.session.session import Gauge
 
+pytestmark = pytest.mark.usefixtures("module_of_few_tool_points")
+
 QUICK = SolverOptions("variable-projection")
 ERRORS = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "y_slide.backlash": 50e-6}
 

@@ -1,4 +1,4 @@
-"""Tables row by row: the same numbers as all at once, and no row stops another."""
+"""Tables row by row, from files and pipes: the same numbers as all at once, in bounded memory."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED
+from calibrated import EXPERIMENT_2, calibrated, identified
 from commands import run_orthocal
 from effect_plans import effect_plan
 
-from orthocal import assess_tool, calibrate, simulate_session
+from orthocal import assess_tool, simulate_session
 from orthocal.assessment import tool_tables as module
 from orthocal.assessment.tool_error import Workspace
 from orthocal.assessment.tool_tables import (
@@ -23,16 +23,21 @@ from orthocal.assessment.tool_tables import (
     row_blocks,
 )
 from orthocal.calibration.file import write_calibration
+from orthocal.cli import printing
 from orthocal.effects.compensation import JointTrim
+from orthocal.errors import SessionError
+from orthocal.io.files import read_lines
 from orthocal.kinematics.conditions import UseConditions
+from orthocal.measurement.files import coordinate_tables
+from orthocal.units import MM
 
 OUT_OF_REACH = [0.0, 0.0, 0.9]
 BEYOND_TRAVEL = [0.1, 0.0, 0.0]
 
 
 @pytest.fixture(scope="module")
-def calibration(experiment_2):
-    return calibrate(experiment_2, **UNJUDGED)
+def calibration():
+    return calibrated(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +46,7 @@ def compensated():
     trims = tuple(JointTrim(amount) for amount in (0.1e-3, 0.06e-3, 0.02e-3))
     plan = replace(effect_plan("backlash"), compensation=trims)
     errors = {"x_slide.backlash": 0.03e-3, "y_slide.offset": 0.2e-3}
-    return calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
+    return identified(simulate_session(plan, errors, seed=1).session, "full")
 
 
 @pytest.fixture(autouse=True)
@@ -154,10 +159,10 @@ def test_a_table_of_which_no_row_can_be_reached_is_bad_input(orthocal):
 
 def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
     """What is held is a chunk and the rows themselves."""
-    monkeypatch.setattr(module, "CHUNK_SIZE", 100)
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (1000, 3))
+    monkeypatch.setattr(module, "CHUNK_SIZE", 40)
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (400, 3))
     peaks = []
-    for count in (100, 1000):
+    for count in (40, 400):
         tracemalloc.start()
         for _ in accuracy_rows(calibration, points[:count]):
             pass
@@ -170,3 +175,113 @@ def test_json_of_too_many_points_is_refused(orthocal):
     code, _, err = orthocal("accuracy", "x_mm,y_mm,z_mm\n" + "0,0,0\n" * 5001, "--json")
     assert code == 2
     assert "contains 5001 points; expected at most 5000 with --json" in err
+
+
+HEADER = "x_mm,y_mm,z_mm\n"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("calibration")
+    return write_calibration(calibrated(EXPERIMENT_2), path / "calibration.json").parent
+
+
+@pytest.fixture
+def through_pipe(monkeypatch, folder):
+    monkeypatch.setattr(coordinate_tables, "BLOCK_ROWS", 4)
+
+    def run(command, text, *, path="-"):
+        done = run_orthocal(folder, command, folder, path, typed=text)
+        return done.returncode, done.stdout, done.stderr
+
+    return run
+
+
+def test_a_pipe_gives_what_a_file_gives(through_pipe, tmp_path):
+    points = np.random.default_rng(0).uniform(-40, 40, (11, 3))
+    text = HEADER + "".join(f"{x:.3f},{y:.3f},{z:.3f}\r\n" for x, y, z in points)
+    (tmp_path / "t.csv").write_text(text)
+    expected = through_pipe("inverse", "", path=tmp_path / "t.csv")
+    found = through_pipe("inverse", "\ufeff" + text)
+    assert found == expected
+    assert (found[0], found[1].count("\n")) == (0, 12)
+    back = through_pipe("forward", found[1])[1].splitlines()[1:]
+    again = np.array([[float(v) for v in line.split(",")] for line in back])
+    assert np.abs(again - points).max() < 1e-3
+
+
+def test_rows_have_no_negative_zero():
+    rows = np.array([[-1e-12, 2.0], [-0.6e-9, np.nan], [-0.6e-9, 0.4e-9]])
+    text = coordinate_tables.format_rows({"x_mm": MM, "y_mm": MM}, rows)
+    assert text.split() == ["0.000000,2000.000000", ",", "-0.000001,0.000000"]
+
+
+def test_a_wrong_line_of_a_pipe_is_named_and_what_came_before_is_served(through_pipe, tmp_path):
+    text = HEADER + "0,0,0\n" * 9 + "0,q,0\n"
+    code, out, err = through_pipe("inverse", text)
+    assert (code, out.count("\n")) == (2, 9)
+    assert err == (
+        "orthocal: standard input:11: y_mm is 'q'; expected a number; the 8 rows in blocks before "
+        "it were evaluated\n"
+    )
+    (tmp_path / "t.csv").write_text(text)
+    code, out, err = through_pipe("inverse", "", path=tmp_path / "t.csv")
+    assert (code, out) == (2, "")
+    assert err == f"orthocal: {tmp_path}/t.csv:11: y_mm is 'q'; expected a number\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "standard input:1: is empty; expected a header: x_mm,y_mm,z_mm"),
+        ("\n0,0,0\n", "standard input:1: is blank; expected a header: x_mm,y_mm,z_mm"),
+        (HEADER, "standard input: holds no rows"),
+        ("a,b\n", "standard input:1: unknown column 'a'; expected x_mm, y_mm, z_mm"),
+        (HEADER + "0" * 200_000, "standard input:2: has a line of more than 131072 characters"),
+    ],
+)
+def test_what_is_no_table_is_refused(through_pipe, text, message):
+    assert through_pipe("inverse", text) == (2, "", f"orthocal: {message}\n")
+
+
+def test_many_rows_out_of_reach_are_not_kept(through_pipe, monkeypatch):
+    monkeypatch.setattr(printing, "MOST_HELD", 8)
+    code, out, err = through_pipe("inverse", HEADER + "0,0,900\n" * 13)
+    assert (code, out.count("\n")) == (3, 14)
+    assert err.count("cannot be reached: ") == 13
+
+
+def test_text_that_is_none_is_named_by_its_byte():
+    text = b"\xef\xbb\xbfabc\r\n" * 3 + b"d\rlast"
+    lines = list(read_lines(io.BytesIO(text[3:]), longest=100, name="t"))
+    assert lines == ["abc\n", "\ufeffabc\n", "\ufeffabc\n", "d\n", "last"]
+    content = b"good\n" * 20_000 + b"\xff"
+    with pytest.raises(SessionError, match=r"^t: is not UTF-8 text \(byte 100000\)"):
+        list(read_lines(io.BytesIO(content), longest=100, name="t", error=SessionError))
+
+
+def test_memory_does_not_grow_with_the_stream(monkeypatch):
+    """Reading, evaluating and printing a long pipe, whose lines are made as they are read."""
+    monkeypatch.setattr(coordinate_tables, "BLOCK_ROWS", 50)
+    calibration = calibrated(EXPERIMENT_2)
+
+    class Pipe(io.RawIOBase):
+        def __init__(self, count):
+            self.lines = iter([HEADER.encode(), *[b"1,2,3\n"] * count])
+
+        def readable(self):
+            return True
+
+        def readline(self, size=-1):
+            return next(self.lines, b"")
+
+    peaks = []
+    for count in (100, 1000):
+        pipe = Pipe(count)
+        tracemalloc.start()
+        blocks = coordinate_tables.stream_points(pipe, calibration.robot, name="p")
+        served = sum(len(c.values) for c in inverse_blocks(calibration, blocks))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert served == count
+    assert peaks[1] < 1.3 * peaks[0]

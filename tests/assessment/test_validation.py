@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 from calibrated import UNJUDGED, calibrated, identified, plan_of, session_of
-from effect_plans import FEW, effect_plan
+from effect_plans import FEW, sided_plan
 from models import TRUTH
 from planned import quick_plan
 from scipy.stats import binom, chi2
@@ -20,7 +20,6 @@ from tolerances import THREE_DECIMALS_MM
 from orthocal import (
     Choice,
     calibrate,
-    check_session,
     draw_errors,
     join_sessions,
     simulate_session,
@@ -38,13 +37,17 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
-from orthocal.assessment.validation import ENTRY_KINDS, _compare_tool_errors, _with_active_offsets
+from orthocal.assessment.validation import (
+    ENTRY_KINDS,
+    _assumed,
+    _compare_tool_errors,
+    _with_active_offsets,
+)
 from orthocal.assessment.wording import join_texts, tool_mm
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
-from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import calibrated_theta, repeat_fit
 from orthocal.errors import SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
@@ -52,7 +55,7 @@ from orthocal.observation.observations import build_observations
 from orthocal.output.text.summary import result_json
 from orthocal.statistics.chance import BY_CHANCE
 
-pytestmark = pytest.mark.usefixtures("assessed_once")
+pytestmark = pytest.mark.usefixtures("assessed_once", "module_of_few_tool_points")
 
 QUICK = {"solver": "variable-projection"}
 
@@ -187,8 +190,7 @@ def test_the_probability_of_a_repetition_is_that_of_a_random_direction(sign):
 )
 def test_the_probability_of_a_repetition_is_printed(chance, text):
     found = describe_repetition(Repetition(6, 0.5, chance))
-    assert text not in found.text
-    assert text in describe_evidence(found)
+    assert (text in found.text, text in describe_evidence(found)) == (False, True)
 
 
 def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
@@ -196,7 +198,7 @@ def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
     count, probabilities, repeats = 10, [], []
     for seed in range(2, 2 + 2 * count, 2):
         first = simulate_session(plan, TRUTH, seed=seed + 1).session
-        before, _ = identify(first, **QUICK)
+        before = identified(first)
         entered = np.round([p.value for p in before.free], 6)
         after = simulate_session(plan.with_controller(entered), TRUTH, seed=seed).session
         fit = repeat_fit(before, after)
@@ -211,7 +213,7 @@ def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):
 @pytest.mark.parametrize(("sigma_um", "seed"), [(2.0, 3), (50.0, 5)])
 def test_another_gauge_has_its_own_noise(plan, sigma_um, seed):
     first = simulate_session(plan, TRUTH, seed=seed).session
-    before, _ = identify(first, "full", **QUICK)
+    before = identified(first, "full")
     other = plan.with_gauge(replace(plan.gauge, sigma=sigma_um * 1e-6, resolution=None))
     offsets = [before[f"{d.name}.offset"].value for d in plan.robot.drives]
     entered = other.with_controller(np.round(offsets, 6))
@@ -355,7 +357,8 @@ def test_the_setup_to_read_again_is_the_one_that_disagrees_with_the_others():
     plan, named, unconfirmed = quick_plan().session, 0, 0
     for seed in range(3):
         errors = draw_machine(plan.robot, seed)
-        calibration = identified(simulate_session(plan, errors, seed=seed).session)
+        first = simulate_session(plan, errors, seed=seed).session
+        calibration = identified(first)
         session = measure_again(plan, calibration, errors, seed=seed + 1000)
         setup = list(session.setups)[seed % len(session.setups)]
         values = session.values
@@ -481,7 +484,7 @@ def assert_nothing_new_to_enter(result):
 @pytest.fixture(scope="module")
 def with_backlash():
     """Plan and errors of a machine with backlash, and its calibration."""
-    plan = effect_plan("backlash", setups=FEW).with_controller(np.zeros(3))
+    plan = sided_plan(FEW).with_controller(np.zeros(3))
     errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
     errors |= {f"{d.name}.offset": 0.2e-3 for d in plan.robot.drives}
     errors |= {f"{d.name}.backlash": 60e-6 for d in plan.robot.drives}
@@ -513,10 +516,12 @@ def test_backlash_of_the_calibration_is_assumed_with_its_offsets(with_backlash):
     entered = replace(entered, compensation=compensation_to_enter(calibration))
     stated = replace(simulate_session(entered, errors, seed=2).session, compensation=())
     silent = replace(stated.with_controller(np.zeros(3)), controller_offsets=None)
-    result = validate_calibration(calibration, silent)
-    assert result.confirmed
-    (assumed,) = result.assessment.of_kind("controller assumed")
-    assert "offsets and the backlash" in assumed.text
+    assumed = _with_active_offsets(calibration, silent)
+    backlash = [[t.backlash for t in s.compensation] for s in (assumed, entered)]
+    assert backlash[0] == backlash[1]
+    assert assumed.active_offsets.tolist() == entered.active_offsets.tolist()
+    (note,) = _assumed(calibration, [silent])
+    assert "offsets and the backlash" in note.text
     result = validate_calibration(calibration, stated)
     assert result.confirmed is False
     changed = result.assessment.of_kind("machine changed")
@@ -529,7 +534,7 @@ def test_backlash_of_the_calibration_is_assumed_with_its_offsets(with_backlash):
 
 def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(plan):
     """New readings with three times the noise: nothing odd in all of them, but not as predicted."""
-    errors, first, calibration = calibrated_machine("raw-cycles", "full", 3)
+    errors, _, calibration = calibrated_machine("raw-cycles", "full", 3)
     session = measure_again(plan, calibration, errors, seed=4, sigma=15e-6)
     result = validate_calibration(calibration, session)
     (larger,) = result.assessment.of_kind("larger than predicted")
@@ -541,8 +546,7 @@ def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(
     document = json.loads(result_json(result))
     assert document["confirmed"] is False
     assert document["decision"]["exit_code"] == 3
-    checked = check_session(join_sessions([first, session]))
-    assert document["decision"]["verdict"] == checked.decision.verdict == "enter"
+    assert document["decision"]["verdict"] == "enter"
 
 
 def test_a_wrong_new_reading_makes_a_validation_inconclusive(plan):
@@ -572,16 +576,6 @@ def test_new_readings_that_do_not_repeat_make_a_validation_inconclusive(plan):
     assert result.confirmed is None
     assert result.as_expected is False
     assert result.assessment.decision.action.endswith("Then validate again.")
-
-
-def test_an_inconclusive_validation_states_reason_and_next_step_only(plan):
-    """The new readings agree, but the earlier session has an anomaly."""
-    first = misread(simulate_session(plan, TRUTH, seed=1).session)
-    doubtful = calibrate(first, **UNJUDGED)
-    result = validate_calibration(doubtful, measure_again(plan, doubtful, TRUTH, seed=2))
-    assert result.confirmed is None
-    assert result.enter == ()
-    assert_nothing_new_to_enter(result)
 
 
 def test_after_a_list_the_next_reason_begins_a_new_line():

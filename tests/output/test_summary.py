@@ -126,6 +126,8 @@ def test_a_fit_is_explained(raw_cycles, experiment_2, case):
     make, numbers = EXPLAINED[case]
     result = make(raw_cycles, experiment_2)
     (found,) = result.assessment.of_kind(case.removesuffix(" beside cycles"))
+    assert result.assessment.decision.verdict == "enter"
+    assert all(f.severity == "note" for f in result.assessment.findings)
     for name, value in numbers.items():
         assert found.numbers[name] == pytest.approx(value, rel=0.02)
     assert " ".join(found.text.split()) in " ".join(summarize(result, details=True).split())

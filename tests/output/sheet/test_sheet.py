@@ -1,4 +1,4 @@
-"""The measuring sheet: its setups and rows, the joints to command, the place of the gauge.
+"""The measuring sheet: setups and rows, joints to command, the place of the gauge, and pictures.
 
 Numbers are compared with Pinocchio's loop closures and placements.
 """
@@ -9,16 +9,19 @@ import re
 import shutil
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import permutations
+from itertools import combinations, permutations, product
 
 import numpy as np
 import pytest
 from browser import open_browser, visit
+from calibrated import plan_of
 from commands import run_orthocal
 from conftest import marked_pictures
 from gauges import with_gauges
 from lxml import etree
 from machines import place
+from matplotlib.path import Path
+from scipy.spatial import ConvexHull
 
 from orthocal import load_plan, write_session
 from orthocal.builder.build import make_robot
@@ -26,6 +29,7 @@ from orthocal.builder.machine_file import Counting
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.effects.compensation import JointTrim
 from orthocal.output.sheet.page import sheet_files
+from orthocal.output.sheet.pictures import TOUCHED, Picture, outline
 from orthocal.session.session import Conditions
 from orthocal.units import MM
 
@@ -66,6 +70,11 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="module")
 def files(small):
     return sheet_files(small)
+
+
+def page_of(plan):
+    """The sheet of a plan, parsed."""
+    return etree.HTML(sheet_files(plan)["sheet.html"])
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +140,8 @@ def test_stated_contact_is_on_the_rod(small, page):
 def test_the_contact_is_stated_from_the_tool_where_the_gauge_is_mounted(small):
     """On the centre line of leg x, which is 125 mm from the slide in the mechanical zero."""
     setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="<out>")}
-    page = etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"])
-    text = next(words(s) for s in sections(page) if words(s.find("h2")).endswith(": zx"))
+    found = sections(page_of(replace(small, setups=setups)))
+    text = next(words(s) for s in found if words(s.find("h2")).endswith(": zx"))
     drives = small.postures["<out>"].drives
     root, tip, tool = (
         place(small.robot, drives, frame) for frame in ("x_leg_root", "x_leg_tip", "tcp")
@@ -150,7 +159,7 @@ def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod and hinge."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
     session = replace(small, readings=tuple(readings))
-    text = words(sections(etree.HTML(sheet_files(session)["sheet.html"]))[0])
+    text = words(sections(page_of(session))[0])
     robot = small.robot
     drives = small.postures["<out>"].drives
     root, tip = (place(robot, drives, f) for f in ("x_bar_a", "x_coupler"))
@@ -175,7 +184,7 @@ def test_alignment_posture_comes_before_the_first(small):
     setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="in&")}
     (section,) = [
         s
-        for s in sections(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]))
+        for s in sections(page_of(replace(small, setups=setups)))
         if words(s.find("h2")).endswith(": zx")
     ]
     steps = [words(li) for li in section.xpath(".//ol/li")]
@@ -183,7 +192,7 @@ def test_alignment_posture_comes_before_the_first(small):
     assert steps[0].startswith(f"Move to the alignment posture, in&: x_slide {joints[0]} mm")
     assert steps[3].startswith("Move to the first posture, zero: x_slide 0.000 mm")
     assert "gauge zero" in steps[4]
-    section = sections(etree.HTML(sheet_files(small)["sheet.html"]))[2]
+    section = sections(page_of(small))[2]
     steps = [words(li) for li in section.xpath(".//ol/li")]
     assert steps[0].startswith("Move to the alignment posture, which is also the first posture")
     assert "gauge zero" in steps[3]
@@ -313,7 +322,7 @@ def test_tip_near_a_hinge_causes_a_warning(small):
     sensor = small.setups["xy"].sensor
     near = replace(sensor, section=replace(sensor.section, value=0.99))
     setups = {**small.setups, "xy": replace(small.setups["xy"], sensor=near)}
-    text = words(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]).find("body"))
+    text = words(page_of(replace(small, setups=setups)).find("body"))
     assert text.count("of the middle of a hinge") == 1
 
 
@@ -323,7 +332,7 @@ def test_a_gauge_between_two_rods_causes_a_warning(small):
     for direction, between in (("y", False), ("z", False), ("-z", True)):
         sensor = replace(setup.sensor, direction=direction)
         plan = replace(small, setups={**small.setups, "<b>yx": replace(setup, sensor=sensor)})
-        section = sections(etree.HTML(sheet_files(plan)["sheet.html"]))[0]
+        section = sections(page_of(plan))[0]
         warning = "between rods a and b, with 52 mm for dial and plunger"
         assert (warning in words(section)) is between
         assert ("touch rod b instead" in words(section)) is between
@@ -345,7 +354,7 @@ def test_a_machine_with_cranks_is_described_without_slides(root, tmp_path):
         "setups: {up: {leg: left, touches: a, tip: {ball: {radius_mm: 1.5}}, "
         "direction: [0, 0, 1], section: {fraction: 0.5}}}\n"
     )
-    text = words(etree.HTML(sheet_files(load_plan(tmp_path / "plan.yaml"))["sheet.html"]))
+    text = words(page_of(load_plan(tmp_path / "plan.yaml")))
     assert "Jog each joint a little counterclockwise as seen from +z. Its number must grow" in text
     assert "leg left, gauge in z, at 0.5 of its length from the crank at the mechanical" in text
     assert "100.0 mm from the hinge on the crank" in text
@@ -364,13 +373,17 @@ def test_sessions_have_sheets(experiment_2):
     assert "set to 0" in words(page.find("body"))
 
 
-def test_a_planar_robot_has_a_sheet(root, tmp_path):
-    (tmp_path / "plan.yaml").write_text(
-        f"robot: {root / 'tests/robots/biglide'}\n"
-        "postures: {zero: {joints_mm: [200, 200]}, out: {tcp_mm: [10, -5]}}\n"
+def planar_sheet(folder, robot, out):
+    """Files of the sheet of two postures of a planar robot."""
+    (folder / "plan.yaml").write_text(
+        f"robot: {robot}\npostures: {{zero: {{joints_mm: [200, 200]}}, out: {{{out}}}}}\n"
         "setups: {yx: {leg: x, direction: y, section: {fraction: 0.5}}}\n"
     )
-    found = sheet_files(load_plan(tmp_path / "plan.yaml"))
+    return sheet_files(load_plan(folder / "plan.yaml"))
+
+
+def test_a_planar_robot_has_a_sheet(root, tmp_path):
+    found = planar_sheet(tmp_path, root / "tests/robots/biglide", "tcp_mm: [10, -5]")
     assert "Z" not in re.sub(r"\([^)]*\)", "", found["01-yx.ngc"])
     assert len(rows(sections(etree.HTML(found["sheet.html"]))[0])) == 3
 
@@ -380,12 +393,7 @@ def test_sheet_without_a_tool_has_joints_alone(root, tmp_path):
     shutil.copytree(root / "tests/robots/biglide", folder)
     yaml = folder / "biglide.yaml"
     yaml.write_text(re.sub(r"(?m)^ *tcp: .*$", "", yaml.read_text()))
-    (tmp_path / "plan.yaml").write_text(
-        "robot: ./biglide\n"
-        "postures: {zero: {joints_mm: [200, 200]}, out: {joints_mm: [210, 195]}}\n"
-        "setups: {yx: {leg: x, direction: y, section: {fraction: 0.5}}}\n"
-    )
-    found = sheet_files(load_plan(tmp_path / "plan.yaml"))
+    found = planar_sheet(tmp_path, "./biglide", "joints_mm: [210, 195]")
     assert list(found) == ["sheet.html"]
     cells = rows(sections(etree.HTML(found["sheet.html"]))[0])
     assert [r[1:4] for r in cells][1] == ["out", "210.000", "195.000"]
@@ -529,3 +537,171 @@ def test_a_displaced_tip_is_described_in_its_alignment_posture(small, tmp_path):
             text.split()
         )
         assert "centre line by" not in text
+
+
+ROUNDED_GLYPHS = 0.05
+"""Browsers round the extent of glyphs, [mm]."""
+
+SECTIONS = {
+    "x": ("y", "z", "-y", "[0, 1, 1]"),
+    "y": ("x", "-z", "[-1, 0, 2]"),
+    "z": ("x", "-y", "[1, -1, 0]"),
+}
+TIPS = (
+    "touches: a, beside_mm: [0, 0, 0], tip: {ball: {radius_mm: 1}}",
+    "touches: b, beside_mm: [0, 0, 0], tip: {ball: {radius_mm: 8}}",
+    "touches: a, tip: {blade: {width_mm: 44}}",
+    "touches: b, tip: {blade: {width_mm: 60, radius_mm: 2}}",
+)
+
+
+@pytest.fixture(scope="module")
+def all_kinds(tmp_path_factory):
+    """Every leg, direction, rod and tip; aligned in `out`, where balls are off the middle."""
+    setups = [
+        f"  s{i}: {{leg: {leg}, direction: {way}, section: {{fraction: {at}}}{tip}}}"
+        for i, (leg, way, at, tip) in enumerate(
+            (leg, way, (0.3, 0.5, 0.7)[k % 3], tip)
+            for leg, ways in SECTIONS.items()
+            for k, (way, tip) in enumerate(
+                product(ways, ("", *(f", {t}" for t in TIPS[leg != "x" :: 2])))
+            )
+        )
+    ]
+    path = tmp_path_factory.mktemp("plan") / "plan.yaml"
+    path.write_text(
+        "robot: orthoglide\ngauge: {range_mm: [-5, 5]}\n"
+        "postures:\n  out: {tcp_mm: [2, -3, 3]}\n  far: {tcp_mm: [3, -4, 4]}\n"
+        "setups:\n" + "\n".join(setups) + "\n"
+    )
+    return load_plan(path)
+
+
+@pytest.fixture(scope="module")
+def drawn(all_kinds):
+    """The pictures of all setups with their placed labels, and their SVG."""
+    pictures = []
+    place_labels = Picture.place_labels
+    with pytest.MonkeyPatch.context() as patch:
+
+        def place(picture):
+            pictures.append((picture, place_labels(picture)))
+            return pictures[-1][1]
+
+        patch.setattr(Picture, "place_labels", place)
+        page = sheet_files(all_kinds)["sheet.html"]
+    return pictures, re.findall(r"<svg.*?</svg>", page)
+
+
+def box_of(label, middle):
+    """Left, top, right and bottom, [mm]."""
+    return (*(middle - label.half), *(middle + label.half))
+
+
+def overlap(one, other):
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def test_no_label_overlaps_another_or_the_border(all_kinds, drawn):
+    pictures, _ = drawn
+    assert len(pictures) == 2 * len(all_kinds.setups) == 2 * 30
+    texts = [label.text for picture, _ in pictures for label in picture.labels]
+    assert sum("off centre" in text for text in texts) == 10
+    for picture, placed in pictures:
+        assert len(placed) == len(picture.labels)
+        for one, other in combinations(placed, 2):
+            assert not overlap(box_of(*one), box_of(*other)), (one[0].text, other[0].text)
+        for label, middle in placed:
+            assert (middle >= label.half).all(), label.text
+            assert (middle + label.half <= (picture.width, picture.height)).all(), label.text
+
+
+@pytest.mark.acceptance
+def test_labels_in_a_browser_are_inside_their_boxes(browser, drawn, tmp_path):
+    """The real extent of the text, with the fonts that are installed."""
+    pictures, svgs = drawn
+    path = tmp_path / "sheet.html"
+    path.write_text("".join(svgs))
+    with visit(browser, path.as_uri()) as found:
+        extents = found.page.evaluate(
+            """() => [...document.querySelectorAll('svg')].map((svg) =>
+                 [...svg.querySelectorAll('text')].map((text) => text.getBBox()).map((box) =>
+                   [box.x, box.y, box.x + box.width, box.y + box.height]))"""
+        )
+    for (_, placed), texts in zip(pictures, extents, strict=True):
+        for one, other in combinations(texts, 2):
+            assert not overlap(one, other)
+        for (label, middle), extent in zip(placed, texts, strict=True):
+            outside = np.abs(np.reshape(extent, (2, 2)) - middle) > label.half + ROUNDED_GLYPHS
+            assert not outside.any(), label.text
+
+
+def test_no_part_hides_the_place_of_contact_on_a_rod():
+    """A rail of the inclined machine is in front of the contacts of leg c."""
+    page = sheet_files(plan_of("inclined_orthoglide"))["sheet.html"]
+    svgs = [etree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+    machines = [svg for svg in svgs if svg.get("aria-label").endswith("the gauge on the machine")]
+    assert len(machines) == 6
+    transparent = []
+    for svg in machines:
+        shapes = [
+            (
+                p.get("fill"),
+                Path([[float(v) for v in q.split(",")] for q in p.get("points").split()]),
+            )
+            for p in svg.iter("{*}polygon")
+        ]
+        dot = next(c for c in svg.iter("{*}circle") if c.get("r") == "1.10")
+        contact = float(dot.get("cx")), float(dot.get("cy"))
+        sizes = [np.ptp(p.vertices, axis=0).max() * (fill == TOUCHED) for fill, p in shapes]
+        over = [fill for fill, p in shapes[np.argmax(sizes) + 1 :] if p.contains_point(contact)]
+        assert set(over) <= {"none"}
+        transparent.append(len(over))
+    assert transparent == [0, 0, 0, 0, 1, 1]
+
+
+def test_a_label_keeps_off_lines_and_stays_near_its_point():
+    picture = Picture(60.0, 40.0)
+    picture.line([(5.0, 20.0), (55.0, 20.0)])
+    picture.label((30.0, 20.0), "rod a")
+    ((label, middle),) = picture.place_labels()
+    assert abs(middle[1] - 20.0) > label.half[1]
+    assert np.linalg.norm(middle - (30.0, 20.0)) < 5.0
+    assert label.text == "rod a"
+
+
+def test_labels_without_room_are_omitted():
+    picture = Picture(20.0, 8.0)
+    for text in ("first", "second", "a label that is longer than the paper"):
+        picture.label((10.0, 4.0), text)
+    assert [label.text for label, _ in picture.place_labels()] == ["first"]
+
+
+def test_labels_are_texts():
+    picture = Picture(60.0, 40.0)
+    picture.label((-10.0, 90.0), "<script>&\x1b\nsecond")
+    svg = etree.fromstring(picture.to_svg('"<b>').encode())
+    assert svg.get("aria-label") == '"<b>'
+    assert [line.text for line in svg.iter("{*}tspan")] == [r"<script>&\x1b", "second"]
+
+
+@pytest.mark.parametrize("count", [3, 10, 200])
+def test_outlines_are_convex_hulls(count):
+    points = np.random.default_rng(count).normal(size=(count, 2))
+    corners = outline(points)
+    shifted = np.roll(corners, -1, axis=0)
+    area = 0.5 * abs(np.sum(corners[:, 0] * shifted[:, 1] - corners[:, 1] * shifted[:, 0]))
+    assert area == pytest.approx(ConvexHull(points).volume)
+
+
+def test_points_in_a_line_have_their_ends_as_outline():
+    points = np.array([[1.0, 1.0], [0.0, 0.0], [0.5, 0.5], [1.0, 1.0]])
+    assert outline(points).tolist() == [[0.0, 0.0], [1.0, 1.0]]
+
+
+def test_arrows_need_a_length():
+    picture = Picture(60.0, 40.0)
+    picture.arrow((1.0, 1.0), (1.0, 1.0), stroke="#000")
+    assert picture.parts == []
+    picture.arrow((1.0, 1.0), (9.0, 1.0), stroke="#000", both=True)
+    assert len(picture.parts) == 3
