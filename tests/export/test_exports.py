@@ -147,6 +147,7 @@ def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path):
 def disordered(root):
     """Calibration of two sessions, the one with active offsets given first."""
     plan = load_session(root / "examples/raw-cycles")
+    plan = plan.select([r for r in plan.readings if r.cycle == 1])
     truth = {f"{d.name}.offset": 1e-3 for d in plan.robot.drives}
     sessions = [
         simulate_session(plan.with_controller([v] * 3), truth, seed=k).session

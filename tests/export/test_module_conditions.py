@@ -102,7 +102,7 @@ def thermal(tmp_path_factory):
 def test_core_equals_the_machine_at_every_temperature(thermal):
     """At points that were neither fitted nor checked."""
     known, approximation, core = thermal
-    points = points_in_region(400, seed=4)
+    points = points_in_region(150, seed=4)
     largest = []
     for t in TEMPERATURES:
         drives = drives_of(known.robot, core.at(t).inverse(points / MM))
@@ -123,7 +123,7 @@ def test_core_reaches_points_on_an_independent_machine(tmp_path):
     approximation, core = build(tmp_path, known, periodic=True, half_side=SMALL)
     expansion = Expansion(legs=11.5e-6, screws=9e-6, reference=22.0)
     machine = IndependentMachine(folder, errors, lead=5 * MM, expansion=expansion)
-    points = points_in_region(60, seed=3, half_side=SMALL)
+    points = points_in_region(25, seed=3, half_side=SMALL)
     for t in TEMPERATURES:
         drives = drives_of(known.robot, core.at(t).inverse(points / MM))
         states = States(drives, np.zeros_like(drives), np.full(len(drives), t))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibrated import SOUND, UNJUDGED
+from calibrated import SOUND, identified
 from commands import run_orthocal
 from conftest import marked_reports
 from simulated_printer import Printer, nominal, read_settings, rings, write_log, write_settings
@@ -516,7 +516,7 @@ def test_accuracy_of_a_printer_names_no_offsets(calibrated, tmp_path, without_se
 
 
 def test_other_sessions_are_refused(root):
-    calibration = calibrate(load_session(root / "examples/raw-cycles"), "offsets", **UNJUDGED)
+    calibration = identified(load_session(root / "examples/raw-cycles"), "offsets")
     with pytest.raises(ExportError, match=r"controller\.firmware"):
         export_calibration(calibration, "klipper", anyway=True)
 

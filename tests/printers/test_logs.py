@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import identified
 from commands import run_orthocal
 from simulated_printer import Firmware, nominal, rings, write_log, write_settings
 
-from orthocal import calibrate, join_sessions, load_session
+from orthocal import load_session
 from orthocal.cli.files import require_not_calibrated
 from orthocal.errors import SessionError
 from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
@@ -404,7 +405,7 @@ def test_a_copy_of_one_of_several_calibrated_logs_is_refused(tmp_path):
         (tmp_path / "log.txt").write_text(write_log("klipper", odd(), rings(), z, -1.0))
         write_printer_import(import_printer_log(tmp_path / "log.txt"), tmp_path / name)
     old, second, third = (load_session(tmp_path / n) for n in ("old", "second", "third"))
-    calibration = calibrate(join_sessions([old, second]))
+    calibration = identified([old, second])
     require_not_calibrated([third], calibration)
     for copied in (old, second):
         copy = replace(copied, sha256="")
