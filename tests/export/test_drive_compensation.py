@@ -31,11 +31,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assessment.controller_entries import (
-    entered_offsets,
-    find_screws,
-    offsets_to_enter,
-)
+from orthocal.assessment.controller_entries import entered_offsets, find_screws, offsets_to_enter
 from orthocal.effects.compensation import JointTrim
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
@@ -185,11 +181,7 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
     if homes is not None:
         joints = [replace(j, home_offset=h / MM) for j, h in zip(joints, homes, strict=True)]
     motors = run_program(
-        program,
-        joints,
-        lines=lines,
-        module=tmp_path if module else inverse,
-        files=tables,
+        program, joints, lines=lines, module=tmp_path if module else inverse, files=tables
     )
     points = follow(calibration, motors * MM)[::5] / MM
     away = [np.linalg.norm(points - corner, axis=1) for corner in CORNERS]
@@ -789,18 +781,14 @@ def test_motions_are_divided_where_a_drive_reverses():
     at = (10e-3, 0.0, 0.0)
     arc = arc_about(at, at, (0.0, 0.0), plane=17, clockwise=False, turns=1)
     paths = Paths.from_motions(
-        [
-            Motion((0.0, 0.0, 0.0), at),
-            Motion(at, at, arc),
-            Motion(at, (0.0, 0.0, 5e-3)),
-        ]
+        [Motion((0.0, 0.0, 0.0), at), Motion(at, at, arc), Motion(at, (0.0, 0.0, 5e-3))]
     )
     sides = Plain()
     parts = split_at_reversals(paths, sides)
     assert parts.motion.tolist() == [0, *[1] * 4, 2]
     assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
     assert parts.sides.astype(int).tolist() == [
-        *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1]),
+        *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1])
     ]
     assert parts.reversed.all()
     assert sides.last.tolist() == [-1.0, 1.0, 1.0]

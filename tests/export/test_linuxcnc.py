@@ -17,14 +17,7 @@ import pinocchio as pin
 import pytest
 from calibrated import UNJUDGED
 from commands import run_orthocal
-from linuxcnc import (
-    Joint,
-    enter_lines,
-    few_nodes,
-    filter_program,
-    require_linuxcnc,
-    run_program,
-)
+from linuxcnc import Joint, enter_lines, few_nodes, filter_program, require_linuxcnc, run_program
 from programs import distances, rigid_motion
 
 from orthocal import (

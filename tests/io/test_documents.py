@@ -166,11 +166,7 @@ def test_a_calibration_without_free_parameters_is_refused(document, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "model"),
-    [
-        ("table1/experiment-2", "offsets"),
-        ("raw-cycles", "full"),
-    ],
+    ("name", "model"), [("table1/experiment-2", "offsets"), ("raw-cycles", "full")]
 )
 def test_a_written_calibration_reads_the_same(model, name, tmp_path):
     """18 readings beside 126 errors leave a hundredth of a degree of freedom, for example."""

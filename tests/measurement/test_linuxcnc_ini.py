@@ -28,12 +28,7 @@ from orthocal import (
 )
 from orthocal.assessment.controller_entries import find_backlash
 from orthocal.cli.sheet import note_contradictions
-from orthocal.effects.compensation import (
-    JointTrim,
-    compensates_alike,
-    home_positions,
-    with_homes,
-)
+from orthocal.effects.compensation import JointTrim, compensates_alike, home_positions, with_homes
 from orthocal.effects.loading import with_effects
 from orthocal.export.linuxcnc import entered_lines
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints

@@ -162,9 +162,7 @@ def test_repeating_dropping_emptying_and_correcting(plan):
     assert ("yx", "x_max", 1) not in found
     lines = (plan / f"readings.csv{SUFFIX}").read_text().splitlines()
     said = [json.loads(line).get("done") for line in lines]
-    assert said == [
-        *(None, "read", "added", "read", "read", "dropped", "read", "emptied", None),
-    ]
+    assert said == [*(None, "read", "added", "read", "read", "dropped", "read", "emptied", None)]
 
 
 def test_added_rows_are_asked_for_with_their_setup(plan):

@@ -14,12 +14,7 @@ from watchdog import cpu_limit
 from orthocal.errors import SessionError
 from orthocal.io.tables import workbook
 from orthocal.io.tables.cell import MOST_COLUMNS, MOST_ROWS
-from orthocal.io.tables.workbook import (
-    LARGEST_CONTENT,
-    LARGEST_PART,
-    MOST_PARTS,
-    read_workbook,
-)
+from orthocal.io.tables.workbook import LARGEST_CONTENT, LARGEST_PART, MOST_PARTS, read_workbook
 
 SHEET = "xl/worksheets/sheet1.xml"
 STYLES = "xl/styles.xml"
@@ -187,14 +182,8 @@ def test_entities_are_not_resolved(encoding):
             f"<row>{'<c><v>1</v></c>' * 500}</row>" * (CELLS // 500 + 1),
             f"sheet 'Sheet': has more than {CELLS} cells",
         ),
-        (
-            "<x/>" * (TAGS + 1),
-            f"has more than {TAGS} XML tags in {SHEET}",
-        ),
-        (
-            '<row r="2"/><row r="1"/>',
-            "is not a readable .xlsx workbook: row 1 follows row 2",
-        ),
+        ("<x/>" * (TAGS + 1), f"has more than {TAGS} XML tags in {SHEET}"),
+        ('<row r="2"/><row r="1"/>', "is not a readable .xlsx workbook: row 1 follows row 2"),
         (
             '<row r="1"><c r="B1"/><c r="A1"/></row>',
             "is not a readable .xlsx workbook: cell A1 is out of order",
@@ -228,10 +217,7 @@ def test_sheets_that_are_refused(rows, message, monkeypatch):
         ({SHEET: b"<worksheet>"}, "is not a readable .xlsx workbook: Premature end of data"),
         ({SHEET: None}, f"is damaged: {SHEET} is missing"),
         ({"xl/workbook.xml": b"<a/>"}, "is a workbook without worksheets"),
-        (
-            {f"a{i}": b"" for i in range(2001)},
-            f"has 2010 parts; expected at most {MOST_PARTS}",
-        ),
+        ({f"a{i}": b"" for i in range(2001)}, f"has 2010 parts; expected at most {MOST_PARTS}"),
     ],
     ids=["ods", "xlsb", "zip", "cut-off", "no-sheet", "no-sheets", "many-parts"],
 )
