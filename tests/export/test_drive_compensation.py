@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import product
 from unittest.mock import patch
 
 import numpy as np
@@ -268,41 +269,9 @@ def test_latch_direction_is_positive_by_default(calibration):
         displaced = "The module contains half" if module else "is subtracted from HOME_OFFSET"
         assert re.findall("The module contains half|is .* from HOME_OFFSET", page) == [displaced]
     lines = default["joints.ini"]
-    other = [float(v) for v in re.findall(r"negative: HOME_OFFSET = (\S+)", lines)]
-    opposite = home_offsets(export(module=False, latched=(-1, -1, -1))["joints.ini"])
-    assert other == opposite
+    opposite = [float(v) for v in re.findall(r"negative: HOME_OFFSET = (\S+)", lines)]
     backlash = [TRUTH[f"{d.name}.backlash"] / MM for d in calibration.robot.drives]
     assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3
-
-
-@pytest.mark.parametrize("end", [0, 1])
-def test_limits_contain_the_home_offset_of_either_latch_direction(calibration, end):
-    """Also if the switch is at a limit, from where backlash displaces HOME_OFFSET."""
-    active = calibration.session.controller_offsets
-    switches = tuple(
-        d.joint_limits[end] + d.direction * offset
-        for d, offset in zip(calibration.robot.drives, active, strict=True)
-    )
-
-    def lines(latched):
-        options = ExportOptions(home_offsets=switches, latched=latched, module=False)
-        return export_calibration(calibration, "linuxcnc", anyway=True, options=options)[
-            "joints.ini"
-        ]
-
-    default = lines(None)
-    for prefix, latched in (("", (1, 1, 1)), (r"(?:.* negative: )", (-1, -1, -1))):
-        for i, section in enumerate(default.split("[JOINT_")[1:]):
-            read = {
-                key: re.findall(rf"(?m)^{prefix}{key} = (\S+)", section)
-                or re.findall(rf"(?m)^{key} = (\S+)", section)
-                for key in ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")
-            }
-            low, home, high = (float(v[0]) for v in read.values())
-            assert low <= home <= high
-            stated = lines(latched).split("[JOINT_")[i + 1]
-            for key, found in read.items():
-                assert re.findall(rf"(?m)^{key} = (\S+)", stated) == found
 
 
 def enter_export(calibration, folder, options):
@@ -443,15 +412,24 @@ def test_a_switch_at_a_limit_stays_within_the_limits(calibration, end):
     limits = [np.array(d.joint_limits) + d.direction * active for d, active in drives]
     old = tuple(float(pair[end]) for pair in limits)
     outside = 0
-    for latched in ((1, 1, 1), (-1, -1, -1)):
+
+    def lines(latched):
         options = ExportOptions(module=False, latched=latched, home_offsets=old)
         files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-        lines = files["joints.ini"]
-        homes = home_offsets(lines)
-        low, high = (
-            [float(v) for v in re.findall(rf"^{name}_LIMIT = (\S+)", lines, re.M)]
-            for name in ("MIN", "MAX")
+        return files["joints.ini"].split("[JOINT_")[1:]
+
+    default = lines(None)
+    for prefix, latched in (("", (1, 1, 1)), (r"(?:.* negative: )", (-1, -1, -1))):
+        stated = lines(latched)
+        low, homes, high = (
+            [float(re.search(rf"(?m)^{key} = (\S+)", text)[1]) for text in stated]
+            for key in ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")
         )
+        # without a direction the lines state the numbers of both
+        for i, key in product(range(3), ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")):
+            found = re.findall(rf"(?m)^{prefix}{key} = (\S+)", default[i])
+            found = found or re.findall(rf"(?m)^{key} = (\S+)", default[i])
+            assert found == re.findall(rf"(?m)^{key} = (\S+)", stated[i])
         for i, d in enumerate(calibration.robot.drives):
             assert low[i] <= homes[i] <= high[i]
             change = d.direction * (offsets_to_enter(calibration)[i] - ACTIVE[i])
@@ -750,20 +728,6 @@ def test_program_for_a_controller_with_compensation(
 
 SIDED = 1.0e-6
 """Part of the periodic errors that depends on the side, in drives: 0.2 µm each, [m]."""
-
-
-def test_lags_are_half_the_backlash(calibration, orthoglide):
-    lags = find_lags(calibration.robot, calibration.errors)
-    half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
-    assert lags == pytest.approx(half, rel=1e-9)
-    assert not find_lags(orthoglide, {}).any()
-
-
-def test_drives_without_backlash_change_no_program(calibration):
-    """Such sides divide motions, but do not move their ends."""
-    points = np.array([[10.0, 5.0, 0.0], [20.0, -5.0, 30.0]]) * MM
-    sides = ApproachSides(calibration, ACTIVE, np.zeros(3))
-    assert np.array_equal(sides.command(points, np.ones((2, 3))), points)
 
 
 def test_motions_are_divided_where_a_drive_reverses():

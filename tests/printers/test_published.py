@@ -144,7 +144,9 @@ def test_trims_that_absorb_other_errors_are_undone(tmp_path):
     z = printer.probe(present, xy, noise=0.02, rng=np.random.default_rng(5))
     log.write_text(write_log("marlin", present, xy, z))
     imported = import_printer_log(log)
-    assert any("absorb" in note for note in imported.log.notes)
+    assert any("absorb" in note and "+6.158" in note for note in imported.log.notes)
+    lengths = [leg.length for leg in imported.session.robot.legs.values()]
+    assert lengths == pytest.approx([0.18038] * 3, abs=1e-5)
     result = identified(imported.session)
     lines = FIRMWARES["marlin"].config_lines(fit_firmware(result, "marlin").settings)
     new = read_settings("marlin", lines)
