@@ -598,6 +598,8 @@ def test_times_of_a_table(session):
     clock = [f"{head};Zeitpunkt", *(f"{r};9:26" for r in rows)]
     read(session, text("clock", "\n".join(clock)))
     assert {r.conditions for r in load_session(session).readings} == {None}
+    refused = read(session, text("clock", "\n".join(clock), columns={"time": "Zeitpunkt"}))
+    assert "time is '9:26'" in refused
 
 
 def test_planned_sides_are_matched_or_asked_for(session, orthocal):

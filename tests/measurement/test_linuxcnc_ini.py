@@ -320,25 +320,10 @@ def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
     assert not change.any()
 
 
-def test_latching_is_positive_by_default_and_said_to_be(folder, one, plain):
-    home = ["--home-offset", "352.5,340,-3.25"]
-    default = export(folder, one, "default", *home)
-    assert "Assumed: HOME_LATCH_VEL of all joints is positive. " in default.stderr
-    lines = [v for v in plain.read_text().splitlines() if not v.startswith("HOME_LATCH_VEL")]
-    (folder / "unlatched.ini").write_text("\n".join(lines))
-    by_file = export(folder, one, "unlatched", "--ini", folder / "unlatched.ini")
-    assert "unlatched.ini does not state it" in by_file.stderr
-    assert "--ini" not in by_file.stderr
-    stated = export(folder, one, "stated", *home, "--latched", "+,+,+")
-    assert "Assumed" not in stated.stderr
-    texts = [(folder / name / "joints.ini").read_text() for name in ("default", "stated")]
-    entered = [re.findall(r"^HOME_OFFSET = (\S+)", text, re.M) for text in texts]
-    assert entered[0] == entered[1]
-    assert len(entered[0]) == 3
-
-
 def test_the_assumed_direction_of_a_single_joint_is_named(folder, one, plain):
     """If it is positive by assumption, the other number is beside it; an option states it."""
+    done = export(folder, one, "default", "--home-offset", "352.5,340,-3.25")
+    assert "Assumed: HOME_LATCH_VEL of all joints is positive. " in done.stderr
     text = plain.read_text().replace("HOME_LATCH_VEL = 0.5", "")
     (folder / "partial.ini").write_text(text)
     done = export(folder, one, "assumed", "--ini", "partial.ini")
@@ -346,7 +331,9 @@ def test_the_assumed_direction_of_a_single_joint_is_named(folder, one, plain):
     assert "Assumed: HOME_LATCH_VEL of JOINT_2 is positive (partial.ini does not state" in note
     assert "--ini FILE" not in note
     assert "The sign + of JOINT_2 is assumed" in (folder / "assumed/README.md").read_text()
-    lines = (folder / "assumed/joints.ini").read_text()
+    path = folder / "assumed/joints.ini"
+    assert read_controller_joints(path, load_calibration(one).robot).latched == (0, 0, 0)
+    lines = path.read_text()
     assert lines.count("# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET") == 1
     done = export(folder, one, "stated", "--ini", "partial.ini", "--latched=-,+,-")
     assert "Assumed" not in done.stderr

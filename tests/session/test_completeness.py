@@ -148,12 +148,6 @@ def test_sizes_of_tips_and_mountings_are_not_negative():
             Mounting(direction=size)
 
 
-def test_readings_do_not_count_twice(session):
-    for both in ([session, session], [session, replace(session, title="copy")]):
-        with pytest.raises(SessionError, match="is the same session as one before it"):
-            calibrate(both)
-
-
 def test_a_judgement_is_used_for_its_readings_only(session):
     judgement = judge_session(session)
     other = session.with_values(session.values + 1e-6)

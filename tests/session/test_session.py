@@ -171,21 +171,10 @@ def test_any_session_is_the_same_after_a_round_trip(
     assert np.abs(again.active_offsets - session.active_offsets).max() < 1e-14
 
 
-def test_semicolons_and_a_byte_order_mark_are_read(tmp_path):
-    rows = "\ufeffsetup;posture;reading_mm\nyx;zero;0.1\n\nyx;x_max;0.2\n"
-    session = load_session(write(tmp_path / "s", rows=rows))
-    assert np.allclose(session.values, [0.1e-3, 0.2e-3])
-
-
 def test_the_path_may_be_the_file_or_the_directory(root):
     a = load_session(root / "examples/raw-cycles/session.yaml")
     b = load_session(str(root / "examples/raw-cycles"))
     assert a.sha256 == b.sha256
-
-
-def test_a_robot_beside_the_session_is_found(root, tmp_path):
-    head = HEAD.replace("orthoglide", str(root / "robots/orthoglide"))
-    assert load_session(write(tmp_path / "s", head=head)).robot.name == "orthoglide"
 
 
 def test_a_robot_without_legs_cannot_be_measured(root, tmp_path):
