@@ -18,7 +18,16 @@ from commands import run_orthocal
 from effect_plans import write_plan
 from linuxcnc import Joint, few_nodes, play, require_linuxcnc, run_program
 from programs import read_polyline
-from test_linuxcnc import Core, from_pieces, homes_of, require_followed
+from test_linuxcnc import (
+    ACTIVE,
+    SWITCH,
+    Core,
+    from_pieces,
+    homes_of,
+    joints_at_switch,
+    joints_of,
+    require_followed,
+)
 
 from orthocal import (
     Choice,
@@ -42,14 +51,13 @@ from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
+from orthocal.io.files import write_files
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.units import MM, UM
 
 EFFECTS = "backlash: {tolerance_mm: 0.08}, screw: {lead_mm: 10, periodic_tolerance_mm: 0.02}"
 
 JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}"}
-
-ACTIVE = np.array([0.4, -0.1, 0.2]) * MM
 
 TRUTH = {
     "x_slide.offset": 1.2 * MM,
@@ -66,8 +74,6 @@ TRUTH = {
 
 LATCHED = (1, -1, -1)
 """Sign of the search; with the other one the switch may open before the backlash is taken up."""
-
-SWITCH = np.array([352.0, 340.0, 331.0]) * MM
 
 ROUNDING = np.sqrt(3.0) * 0.5e-6
 """Effect of offsets that are entered to 1 µm, [m]."""
@@ -133,22 +139,7 @@ def of_drives(calibration, kind):
 
 def old_home_offsets(calibration):
     """HOME_OFFSET of each joint during the measurement, [m]."""
-    drives = zip(calibration.robot.drives, SWITCH, ACTIVE, strict=True)
-    return tuple(float(d.to_joint(s + active)) for d, s, active in drives)
-
-
-def joints_of(calibration):
-    drives = zip(calibration.robot.drives, SWITCH, ACTIVE, LATCHED, strict=True)
-    return [
-        Joint(
-            d.direction,
-            float(s) / MM,
-            float(d.to_joint(s + active)) / MM,
-            float(d.to_joint(d.zero)) / MM,
-            latched=latched,
-        )
-        for d, s, active, latched in drives
-    ]
+    return tuple(joints_at_switch(calibration, SWITCH))
 
 
 CENTRE, RADIUS = (12.0, -8.0, 15.0), 16.0
@@ -168,8 +159,7 @@ REVERSING = 0.3
 
 
 def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     tables = {name: text for name, text in files.items() if name.endswith(".comp")}
     program = [
         "G21 G90 G61 G1 X24 Y-14 Z12 F6000",  # far enough that all backlash is taken up
@@ -178,9 +168,8 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
         *(f"G1 X{x:g} Y{y:g} Z{z:g} F6000" for x, y, z in CORNERS[2:]),
     ]
     lines = files["kinematics.ini" if module else "joints.ini"]
-    joints = joints_of(calibration)
-    if homes is not None:
-        joints = [replace(j, home_offset=h / MM) for j, h in zip(joints, homes, strict=True)]
+    joints = joints_of(calibration, old_home_offsets(calibration) if homes is None else homes)
+    joints = [replace(j, latched=sign) for j, sign in zip(joints, LATCHED, strict=True)]
     motors = run_program(
         program, joints, lines=lines, module=tmp_path if module else inverse, files=tables
     )
@@ -214,13 +203,11 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     stated = float(re.search(r"error is up to ([\d.]+) µm", files["README.md"])[1])
     assert 0.1 < stated < 1.0
     nominal = tmp_path / "nominal"
-    nominal.mkdir()
     plan = load_plan(write_plan(tmp_path / "plain", effects="", joints=JOINTS))
     exact = simulate_session(plan.with_controller(np.zeros(3)), {}, exact=True).session
     plain = calibrate(exact, "offsets", solver="variable-projection", judgement=SOUND)
     module = export_calibration(plain, "linuxcnc", anyway=True, options=ExportOptions(module=True))
-    for name, text in module.items():
-        (nominal / name).write_text(text)
+    write_files(nominal, module)
     files = {**files, "joints.ini": module["kinematics.ini"] + files["joints.ini"]}
     actual = run(calibration, files, tmp_path, module=False, inverse=nominal)
     within = PATH_ERROR + stated * 1e-6 + ROUNDING
@@ -247,8 +234,7 @@ def home_offsets(lines):
 def enter_export(calibration, folder, options):
     """Session of a calibration with its export entered into the controller, and the files."""
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (folder / name).write_text(text)
+    write_files(folder, files)
     session = replace(
         calibration.session,
         compensation=read_controller_joints(folder / "joints.ini", calibration.robot).compensation,
@@ -446,8 +432,7 @@ def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):
     old = tuple(float(d.to_joint(d.upper + a)) for d, a in zip(drives, ACTIVE, strict=True))
     options = ExportOptions(module=False, latched=latched, home_offsets=old)
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     homes = home_offsets(files["joints.ini"])
     joints = [
         Joint(d.direction, d.upper / MM, h, h, latched=sign)
@@ -516,8 +501,7 @@ def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_p
     under, entered = under_tables
     options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED, home_offsets=entered)
     files = export_calibration(under, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     named = re.findall(r"^COMP_FILE = (\S+)\nCOMP_FILE_TYPE = 1$", files["kinematics.ini"], re.M)
     assert named == [f"joint_{i}_module.comp" for i in range(3)]
     assert "BACKLASH" not in files["kinematics.ini"]

@@ -33,6 +33,7 @@ from orthocal.assessment.wording import MOST_ACTIONS, describe_actions, review
 from orthocal.calibration.assessment_record import Assessment, Decision, Place
 from orthocal.cli.correct import _with_comments
 from orthocal.export.urdf import _correct_origins, _find_twists
+from orthocal.io.files import write_files
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.observation.simulate import load_errors
 from orthocal.robot.parameters import ElementaryError
@@ -234,16 +235,10 @@ def test_unknown_format_is_refused():
         export_calibration(calibrated(EXPERIMENT_2, **UNJUDGED), "xml")
 
 
-def written(files, folder):
-    folder.mkdir()
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    return folder
-
-
 def test_urdf_is_the_calibrated_machine(full, tmp_path):
     files = export_calibration(full, "urdf")
-    robot = load_robot(written(files, tmp_path / "real"))
+    write_files(tmp_path, files)
+    robot = load_robot(tmp_path)
     scales = {r["drive"]: r["scale_ppm"] for r in csv.DictReader(io.StringIO(files["scales.csv"]))}
     gain = 1.0 + 1e-6 * np.array([float(scales[d.name]) for d in robot.drives])
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))

@@ -34,6 +34,7 @@ from orthocal.export.linuxcnc import approximation as approximating
 from orthocal.export.linuxcnc.approximation import approximate, check_points
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.instructions import write_module_page
+from orthocal.io.files import write_files
 
 MM = 1e-3
 JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}"}
@@ -242,8 +243,7 @@ def test_joints_follow_the_pin_in_linuxcnc(tmp_path):
     )
     options = ExportOptions(module=True, within=WITHIN)
     files = export_calibration(result, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     points = np.array([[25.0, -30.0, 15.0], [-40.0, 10.0, -35.0]])
     words = [" ".join(f"{c}{v:g}" for c, v in zip("XYZ", p, strict=True)) for p in points]
     rest = ["M0", "G4 P0.3"]

@@ -528,21 +528,10 @@ def test_longest_written_line_is_what_linuxcnc_reads(line, end, tmp_path, monkey
 @pytest.mark.parametrize("off", [0.0, 1e-17, -1e-17, 1e-12, -1e-12])
 def test_a_full_circle_may_end_a_rounding_error_beside_its_start(clockwise, turns, off):
     """Both points are computed, such as in G91 and then in G90."""
-    arc = arc_about(
-        (10e-3, 0.0, 0.0),
-        (10e-3, off, 0.0),
-        (5e-3, 0.0),
-        clockwise=clockwise,
-        plane=17,
-        turns=turns,
-    )
-    assert arc.sweep == pytest.approx((-1 if clockwise else 1) * turns * 2.0 * np.pi)
-    short = arc_about(
-        (10e-3, 0.0, 0.0),
-        (10e-3, -1e-6 if clockwise else 1e-6, 0.0),
-        (5e-3, 0.0),
-        clockwise=clockwise,
-        plane=17,
-        turns=1,
-    )
-    assert abs(short.sweep) == pytest.approx(2e-4, rel=1e-6)
+
+    def sweep(y, turns):
+        start, end, centre = (10e-3, 0.0, 0.0), (10e-3, y, 0.0), (5e-3, 0.0)
+        return arc_about(start, end, centre, clockwise=clockwise, plane=17, turns=turns).sweep
+
+    assert sweep(off, turns) == pytest.approx((-1 if clockwise else 1) * turns * 2.0 * np.pi)
+    assert abs(sweep(-1e-6 if clockwise else 1e-6, 1)) == pytest.approx(2e-4, rel=1e-6)

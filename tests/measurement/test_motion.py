@@ -34,6 +34,7 @@ from orthocal.builder.orthoglide import Orthoglide
 from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError, SessionError, UnreachablePathError
 from orthocal.export.linuxcnc.export import ExportOptions
+from orthocal.io.files import write_files
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.motion.approach import (
     USUAL_ANGLE,
@@ -466,8 +467,7 @@ def _run_nominal(session, program, folder, before=((),), *, output=False):
     """A program on nominal legs, after lines of MDI; as `run_programs`."""
     robot = session.robot
     files = _export_nominal(session)
-    for name, text in files.items():
-        (folder / name).write_text(text)
+    write_files(folder, files)
     switch = [d.zero / MM + 10.0 for d in robot.drives]
     joints = [
         Joint(d.direction, s, float(d.to_joint(s * MM)) / MM, float(d.to_joint(d.zero)) / MM)

@@ -230,6 +230,7 @@ def test_reports_of_reprapfirmware(probed):
 
 KLIPPER = write_log("klipper", nominal(), rings()[:4], np.zeros(4), -1.0)
 MARLIN = write_log("marlin", nominal(), rings()[:4], np.zeros(4))
+CFG = write_settings("klipper", nominal())
 RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
 
 
@@ -249,21 +250,9 @@ RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
         (MARLIN.replace("Bed X: -", "Bed -"), "log.txt", "probed points"),
         (MARLIN + "M665 L280.0 R141.5 H300.0\n", "log.txt:", "R is 141.5, and 140 before"),
         (KLIPPER.replace("#*# height1 =", "#*# other ="), "height1", "missing"),
-        (
-            write_settings("klipper", nominal()) + "probe at 0.0,0.0 is z=0,634\n" * 7,
-            "log.txt:",
-            "decimal comma",
-        ),
-        (
-            write_settings("klipper", nominal()) + "probe at 0,000,0,000 is z=0,634\n",
-            "log.txt:",
-            "with a decimal point",
-        ),
-        (
-            write_settings("klipper", nominal()) + "probe: at 0.0,0.0 bed will contact at z=\n",
-            "log.txt:",
-            "contact at z='",
-        ),
+        (CFG + "probe at 0.0,0.0 is z=0,634\n" * 7, "log.txt:", "decimal comma"),
+        (CFG + "probe at 0,000,0,000 is z=0,634\n", "log.txt:", "with a decimal point"),
+        (CFG + "probe: at 0.0,0.0 bed will contact at z=\n", "log.txt:", "contact at z='"),
         (RRF.replace("G30 P3", "G30 P2"), "log.txt:", "4 heights of 3 points"),
         (RRF.replace("heights: 0.0000", "heights: failed"), "log.txt:", "failed"),
     ],

@@ -337,15 +337,6 @@ def test_a_slip_of_04_that_is_not_named_is_within_the_stated_tool_error(printer,
     assert wrong < 0.75 * expected
 
 
-def test_the_absurd_answer_is_refused(printer):
-    """Settings to which a search without priors went: rods of 1620, 773 and 831 mm."""
-    absurd = Firmware(RADIUS, np.array([1620.0, 773.0, 831.0]), printer.settings.angles, np.ones(3))
-    text = write_log("klipper", absurd, rings(), np.zeros(41)) + analysis()
-    printer.log.write_text(text)
-    with pytest.raises(SessionError, match="1620"):
-        import_printer_log(printer.log)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
