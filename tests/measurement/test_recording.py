@@ -483,26 +483,17 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     assert sorted(set(restored)) == [0, 1]
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("0.12", 0.12),
-        (" -0,35 ", -0.35),
-        ("−0.35", -0.35),
-        ("– 1,5", -1.5),
-        ("+.5", 0.5),
-        ("5.", 5.0),
-        ("0,123", 0.123),
-        ("1.234", 1.234),
-        ("1,23", 1.23),
-        ("1,2345", 1.2345),
-        ("0.12 mm", 0.12),
-        ("0,12MM", 0.12),
-        ("-0", 0.0),
-    ],
-)
-def test_numbers_as_people_type_them(text, value):
-    assert parse_typed_reading(text) / MM == pytest.approx(value, abs=1e-15)
+TYPED = {
+    "0.12": 0.12, " -0,35 ": -0.35, "−0.35": -0.35, "– 1,5": -1.5, "+.5": 0.5, "5.": 5.0,
+    "0,123": 0.123, "1.234": 1.234, "1,23": 1.23, "1,2345": 1.2345, "0.12 mm": 0.12, "0,12MM": 0.12,
+    "-0": 0.0,
+}  # fmt: skip
+"""Numbers as people type them, [mm]."""
+
+
+@pytest.mark.parametrize("text", TYPED)
+def test_numbers_as_people_type_them(text):
+    assert parse_typed_reading(text) / MM == pytest.approx(TYPED[text], abs=1e-15)
     assert not np.signbit(parse_typed_reading("-0"))
 
 

@@ -11,14 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tolerances import CLOSED_FORM, KINEMATICS
 
-from orthocal import (
-    Gauge,
-    Section,
-    Tip,
-    load_session,
-    plan_readings,
-    write_session,
-)
+from orthocal import Gauge, Section, Tip, load_session, plan_readings, write_session
 from orthocal.effects.compensation import JointTrim
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import build_problem

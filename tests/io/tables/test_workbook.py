@@ -167,38 +167,38 @@ def test_entities_are_not_resolved(encoding):
     )
 
 
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (
-            f'<row r="{10**9}"><c r="A{10**9}"><v>1</v></c></row>',
-            f"sheet 'Sheet': has more than {MOST_ROWS} rows",
-        ),
-        (
-            '<row r="1"><c r="XFD1"><v>1</v></c></row>',
-            f"sheet 'Sheet': has 16384 columns; expected at most {MOST_COLUMNS}",
-        ),
-        (
-            f"<row>{'<c><v>1</v></c>' * 500}</row>" * (CELLS // 500 + 1),
-            f"sheet 'Sheet': has more than {CELLS} cells",
-        ),
-        ("<x/>" * (TAGS + 1), f"has more than {TAGS} XML tags in {SHEET}"),
-        ('<row r="2"/><row r="1"/>', "is not a readable .xlsx workbook: row 1 follows row 2"),
-        (
-            '<row r="1"><c r="B1"/><c r="A1"/></row>',
-            "is not a readable .xlsx workbook: cell A1 is out of order",
-        ),
-        (
-            '<row r="1"><c r="A1" t="x"><v>1</v></c></row>',
-            "is not a readable .xlsx workbook: 'x' is not the type of a cell",
-        ),
-        (
-            '<row r="1"><c r="A1" t="s"><v>-1</v></c></row>',
-            "is not a readable .xlsx workbook: '-1' is not an index",
-        ),
-    ],
-    ids=["far-row", "far-column", "cells", "tags", "row-order", "cell-order", "type", "index"],
-)
+UNREADABLE = "is not a readable .xlsx workbook: "
+REFUSED = {
+    "far-row": (
+        f'<row r="{10**9}"><c r="A{10**9}"><v>1</v></c></row>',
+        f"sheet 'Sheet': has more than {MOST_ROWS} rows",
+    ),
+    "far-column": (
+        '<row r="1"><c r="XFD1"><v>1</v></c></row>',
+        f"sheet 'Sheet': has 16384 columns; expected at most {MOST_COLUMNS}",
+    ),
+    "cells": (
+        f"<row>{'<c><v>1</v></c>' * 500}</row>" * (CELLS // 500 + 1),
+        f"sheet 'Sheet': has more than {CELLS} cells",
+    ),
+    "tags": ("<x/>" * (TAGS + 1), f"has more than {TAGS} XML tags in {SHEET}"),
+    "row-order": ('<row r="2"/><row r="1"/>', UNREADABLE + "row 1 follows row 2"),
+    "cell-order": (
+        '<row r="1"><c r="B1"/><c r="A1"/></row>',
+        UNREADABLE + "cell A1 is out of order",
+    ),
+    "type": (
+        '<row r="1"><c r="A1" t="x"><v>1</v></c></row>',
+        UNREADABLE + "'x' is not the type of a cell",
+    ),
+    "index": (
+        '<row r="1"><c r="A1" t="s"><v>-1</v></c></row>',
+        UNREADABLE + "'-1' is not an index",
+    ),
+}
+
+
+@pytest.mark.parametrize(("rows", "message"), REFUSED.values(), ids=REFUSED)
 def test_sheets_that_are_refused(rows, message, monkeypatch):
     monkeypatch.setattr(workbook, "MOST_CELLS", CELLS)
     monkeypatch.setattr(workbook, "MOST_TAGS", TAGS)
