@@ -6,17 +6,16 @@ import datetime
 import io
 import json
 import shutil
-import sys
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any
 
 import openpyxl
 import pytest
+from commands import orthocal
 from conftest import ROOT
 
 from orthocal import load_session
-from orthocal.cli import main
 from orthocal.errors import SessionError
 from orthocal.measurement.importing.import_readings import (
     TableOptions,
@@ -373,19 +372,6 @@ def test_a_table_is_imported_exactly_or_refused(form, session):
 PLANNED = "setup,posture,cycle,reading_mm\nxy,zero,1,\nxy,x_max,1,\nxy,zero,2,\nxy,x_max,2,\n"
 
 
-@pytest.fixture
-def orthocal(monkeypatch, capfd):
-    """Runs a command: exit code, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return (stopped.value.code, *capfd.readouterr())
-
-    return run
-
-
 def put(session, table, readings=PLANNED):
     (session / "table.csv").write_text(table, encoding="utf-8")
     if readings is not None:
@@ -393,7 +379,7 @@ def put(session, table, readings=PLANNED):
     return session / "table.csv"
 
 
-def test_a_planned_session_is_filled_in_its_order(session, orthocal):
+def test_a_planned_session_is_filled_in_its_order(session):
     table = put(session, "setup;posture;Zyklus 1 [mm];2 [mm]\nxy;x_max;0,5;\nxy;zero;0,01;-0,02\n")
     code, out, err = orthocal("import", table, session)
     assert (code, err) == (0, f"Wrote {session}/readings.csv\n")
@@ -415,7 +401,7 @@ def test_a_planned_session_is_filled_in_its_order(session, orthocal):
     ]
 
 
-def test_later_imports_add_readings(session, orthocal):
+def test_later_imports_add_readings(session):
     first = put(session, HEAD + "xy;zero;0,01\n")
     assert orthocal("import", first, session)[0] == 0
     second = put(session, HEAD + "xy;zero;0,010\nxy;x_max;0,5\nyx;zero;1\n", None)
@@ -434,7 +420,7 @@ def test_later_imports_add_readings(session, orthocal):
     assert (session / "readings.csv").stat().st_mtime_ns == before.st_mtime_ns
 
 
-def test_an_existing_reading_is_overwritten_with_replace_only(session, orthocal):
+def test_an_existing_reading_is_overwritten_with_replace_only(session):
     there = PLANNED.replace("zero,1,", "zero,1,0.02")
     table = put(session, HEAD + "xy;zero;0,01\n", there)
     code, out, err = orthocal("import", table, session)
@@ -450,7 +436,7 @@ def test_an_existing_reading_is_overwritten_with_replace_only(session, orthocal)
     assert "zero,1,0.01\n" in (session / "readings.csv").read_text()
 
 
-def test_a_dry_run_prints_the_same_and_writes_nothing(session, orthocal):
+def test_a_dry_run_prints_the_same_and_writes_nothing(session):
     table = put(session, HEAD + "xy;zero;0,01\n")
     code, out, err = orthocal("import", table, session, "--dry-run")
     assert (code, err) == (0, "Nothing written (--dry-run)\n")
@@ -458,7 +444,7 @@ def test_a_dry_run_prints_the_same_and_writes_nothing(session, orthocal):
     assert orthocal("import", table, session)[1] == out
 
 
-def test_json_report(session, orthocal):
+def test_json_report(session):
     table = put(session, "Setup;posture;T;Wert\nXY;zero;21;-12,5;gut\n;;;\nxy;x_max;21;\nEnde\n")
     code, out, _ = orthocal("import", table, session, "--json", "--unit", "um")
     assert code == 0
@@ -480,7 +466,7 @@ def test_json_report(session, orthocal):
     assert (document["filled"], document["empty"]) == (1, 3)
 
 
-def test_the_readings_csv_itself_is_rewritten_with_replace_only(session, orthocal):
+def test_the_readings_csv_itself_is_rewritten_with_replace_only(session):
     own = session / "readings.csv"
     german = "Aufstellung;Stellung;Notiz;Wert_mm\nxy;zero;a;1,234\nxy;x_max;b;\n"
     put(session, "", german)
@@ -495,7 +481,7 @@ def test_the_readings_csv_itself_is_rewritten_with_replace_only(session, orthoca
     assert own.read_text() == "setup,posture,reading_mm\nxy,zero,1.234\nxy,x_max,\n"
 
 
-def test_readings_that_contradict_the_session_are_refused(session, orthocal):
+def test_readings_that_contradict_the_session_are_refused(session):
     table = put(session, "setup;posture;minus;reading_mm\nxy;x_max;zero;0,5\n", PLANNED)
     code, _, err = orthocal("import", table, session)
     assert code == 2
@@ -602,7 +588,7 @@ def test_times_of_a_table(session):
     assert "time is '9:26'" in refused
 
 
-def test_planned_sides_are_matched_or_asked_for(session, orthocal):
+def test_planned_sides_are_matched_or_asked_for(session):
     """The only reading of a posture needs no approach in the table; two need it."""
     table = put(session, "setup;posture;Messwert [mm]\nxy;x_max;0,5\n", SIDES)
     assert orthocal("import", table, session)[0] == 0
