@@ -27,7 +27,7 @@ from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.session.session import Conditions
 from orthocal.units import MM
 
-STEPS = (3, 7, *range(40, 46))
+STEPS = (3, 7, *range(20, 26))
 """Steps of writing at which a recording is killed: some of its start, all of several readings."""
 FORK = multiprocessing.get_context("fork")
 

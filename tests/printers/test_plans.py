@@ -39,7 +39,7 @@ def printer(tmp_path):
     equipment = Equipment(owned=(load_owned_sensor(tmp_path / "bar.yaml"),), **FEW)
     with few_balls(2), uncompared(), few_machines():
         plan = plan_readings(
-            log.robot, "offsets", hours=0.25, equipment=equipment, measured=log, starts=1
+            log.robot, "offsets", hours=0.2, equipment=equipment, measured=log, starts=1
         )
     return log, plan.session
 
