@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import product
 from unittest.mock import patch
 
 import numpy as np
@@ -17,7 +18,16 @@ from commands import run_orthocal
 from effect_plans import write_plan
 from linuxcnc import Joint, few_nodes, play, require_linuxcnc, run_program
 from programs import read_polyline
-from test_linuxcnc import Core, from_pieces, homes_of, require_followed
+from test_linuxcnc import (
+    ACTIVE,
+    SWITCH,
+    Core,
+    from_pieces,
+    homes_of,
+    joints_at_switch,
+    joints_of,
+    require_followed,
+)
 
 from orthocal import (
     Choice,
@@ -31,11 +41,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assessment.controller_entries import (
-    entered_offsets,
-    find_screws,
-    offsets_to_enter,
-)
+from orthocal.assessment.controller_entries import entered_offsets, find_screws, offsets_to_enter
 from orthocal.effects.compensation import JointTrim
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
@@ -45,14 +51,13 @@ from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
+from orthocal.io.files import write_files
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.units import MM, UM
 
 EFFECTS = "backlash: {tolerance_mm: 0.08}, screw: {lead_mm: 10, periodic_tolerance_mm: 0.02}"
 
 JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}"}
-
-ACTIVE = np.array([0.4, -0.1, 0.2]) * MM
 
 TRUTH = {
     "x_slide.offset": 1.2 * MM,
@@ -69,8 +74,6 @@ TRUTH = {
 
 LATCHED = (1, -1, -1)
 """Sign of the search; with the other one the switch may open before the backlash is taken up."""
-
-SWITCH = np.array([352.0, 340.0, 331.0]) * MM
 
 ROUNDING = np.sqrt(3.0) * 0.5e-6
 """Effect of offsets that are entered to 1 µm, [m]."""
@@ -136,22 +139,7 @@ def of_drives(calibration, kind):
 
 def old_home_offsets(calibration):
     """HOME_OFFSET of each joint during the measurement, [m]."""
-    drives = zip(calibration.robot.drives, SWITCH, ACTIVE, strict=True)
-    return tuple(float(d.to_joint(s + active)) for d, s, active in drives)
-
-
-def joints_of(calibration):
-    drives = zip(calibration.robot.drives, SWITCH, ACTIVE, LATCHED, strict=True)
-    return [
-        Joint(
-            d.direction,
-            float(s) / MM,
-            float(d.to_joint(s + active)) / MM,
-            float(d.to_joint(d.zero)) / MM,
-            latched=latched,
-        )
-        for d, s, active, latched in drives
-    ]
+    return tuple(joints_at_switch(calibration, SWITCH))
 
 
 CENTRE, RADIUS = (12.0, -8.0, 15.0), 16.0
@@ -171,8 +159,7 @@ REVERSING = 0.3
 
 
 def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     tables = {name: text for name, text in files.items() if name.endswith(".comp")}
     program = [
         "G21 G90 G61 G1 X24 Y-14 Z12 F6000",  # far enough that all backlash is taken up
@@ -181,15 +168,10 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
         *(f"G1 X{x:g} Y{y:g} Z{z:g} F6000" for x, y, z in CORNERS[2:]),
     ]
     lines = files["kinematics.ini" if module else "joints.ini"]
-    joints = joints_of(calibration)
-    if homes is not None:
-        joints = [replace(j, home_offset=h / MM) for j, h in zip(joints, homes, strict=True)]
+    joints = joints_of(calibration, old_home_offsets(calibration) if homes is None else homes)
+    joints = [replace(j, latched=sign) for j, sign in zip(joints, LATCHED, strict=True)]
     motors = run_program(
-        program,
-        joints,
-        lines=lines,
-        module=tmp_path if module else inverse,
-        files=tables,
+        program, joints, lines=lines, module=tmp_path if module else inverse, files=tables
     )
     points = follow(calibration, motors * MM)[::5] / MM
     away = [np.linalg.norm(points - corner, axis=1) for corner in CORNERS]
@@ -221,13 +203,11 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     stated = float(re.search(r"error is up to ([\d.]+) µm", files["README.md"])[1])
     assert 0.1 < stated < 1.0
     nominal = tmp_path / "nominal"
-    nominal.mkdir()
     plan = load_plan(write_plan(tmp_path / "plain", effects="", joints=JOINTS))
     exact = simulate_session(plan.with_controller(np.zeros(3)), {}, exact=True).session
     plain = calibrate(exact, "offsets", solver="variable-projection", judgement=SOUND)
     module = export_calibration(plain, "linuxcnc", anyway=True, options=ExportOptions(module=True))
-    for name, text in module.items():
-        (nominal / name).write_text(text)
+    write_files(nominal, module)
     files = {**files, "joints.ini": module["kinematics.ini"] + files["joints.ini"]}
     actual = run(calibration, files, tmp_path, module=False, inverse=nominal)
     within = PATH_ERROR + stated * 1e-6 + ROUNDING
@@ -251,73 +231,10 @@ def home_offsets(lines):
     return [float(v) for v in re.findall(r"^HOME_OFFSET = (\S+)", lines, re.M)]
 
 
-def test_latch_direction_is_positive_by_default(calibration):
-    """The lines then also state HOME_OFFSET of the other direction."""
-
-    def export(**options):
-        options = ExportOptions(home_offsets=(0.3, 0.3, 0.3), **options)
-        return export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-
-    signs = "# signs of HOME_LATCH_VEL: [+, +, +]\n"  # stated for the next commands
-    for module, file in ((True, "kinematics.ini"), (False, "joints.ini")):
-        default, stated = (export(module=module, latched=s) for s in (None, (1, 1, 1)))
-        assert (signs in default[file], signs in stated[file]) == (False, True)
-        for name in {"joints.ini", "orthocal_core.c"} & default.keys():
-            bare = "".join(
-                line
-                for line in default[name].splitlines(keepends=True)
-                if not line.startswith("# if HOME_LATCH_VEL")
-            )
-            assert bare == stated[name].replace(signs, "")
-        page = " ".join(default["README.md"].split())
-        assert "assumed" in page
-        assert "assumed" not in stated["README.md"]
-        # a module displaces the joints, and HOME_OFFSET remains
-        displaced = "The module contains half" if module else "is subtracted from HOME_OFFSET"
-        assert re.findall("The module contains half|is .* from HOME_OFFSET", page) == [displaced]
-    lines = default["joints.ini"]
-    other = [float(v) for v in re.findall(r"negative: HOME_OFFSET = (\S+)", lines)]
-    opposite = home_offsets(export(module=False, latched=(-1, -1, -1))["joints.ini"])
-    assert other == opposite
-    backlash = [TRUTH[f"{d.name}.backlash"] / MM for d in calibration.robot.drives]
-    assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3
-
-
-@pytest.mark.parametrize("end", [0, 1])
-def test_limits_contain_the_home_offset_of_either_latch_direction(calibration, end):
-    """Also if the switch is at a limit, from where backlash displaces HOME_OFFSET."""
-    active = calibration.session.controller_offsets
-    switches = tuple(
-        d.joint_limits[end] + d.direction * offset
-        for d, offset in zip(calibration.robot.drives, active, strict=True)
-    )
-
-    def lines(latched):
-        options = ExportOptions(home_offsets=switches, latched=latched, module=False)
-        return export_calibration(calibration, "linuxcnc", anyway=True, options=options)[
-            "joints.ini"
-        ]
-
-    default = lines(None)
-    for prefix, latched in (("", (1, 1, 1)), (r"(?:.* negative: )", (-1, -1, -1))):
-        for i, section in enumerate(default.split("[JOINT_")[1:]):
-            read = {
-                key: re.findall(rf"(?m)^{prefix}{key} = (\S+)", section)
-                or re.findall(rf"(?m)^{key} = (\S+)", section)
-                for key in ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")
-            }
-            low, home, high = (float(v[0]) for v in read.values())
-            assert low <= home <= high
-            stated = lines(latched).split("[JOINT_")[i + 1]
-            for key, found in read.items():
-                assert re.findall(rf"(?m)^{key} = (\S+)", stated) == found
-
-
 def enter_export(calibration, folder, options):
     """Session of a calibration with its export entered into the controller, and the files."""
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (folder / name).write_text(text)
+    write_files(folder, files)
     session = replace(
         calibration.session,
         compensation=read_controller_joints(folder / "joints.ini", calibration.robot).compensation,
@@ -451,15 +368,24 @@ def test_a_switch_at_a_limit_stays_within_the_limits(calibration, end):
     limits = [np.array(d.joint_limits) + d.direction * active for d, active in drives]
     old = tuple(float(pair[end]) for pair in limits)
     outside = 0
-    for latched in ((1, 1, 1), (-1, -1, -1)):
+
+    def lines(latched):
         options = ExportOptions(module=False, latched=latched, home_offsets=old)
         files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-        lines = files["joints.ini"]
-        homes = home_offsets(lines)
-        low, high = (
-            [float(v) for v in re.findall(rf"^{name}_LIMIT = (\S+)", lines, re.M)]
-            for name in ("MIN", "MAX")
+        return files["joints.ini"].split("[JOINT_")[1:]
+
+    default = lines(None)
+    for prefix, latched in (("", (1, 1, 1)), (r"(?:.* negative: )", (-1, -1, -1))):
+        stated = lines(latched)
+        low, homes, high = (
+            [float(re.search(rf"(?m)^{key} = (\S+)", text)[1]) for text in stated]
+            for key in ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")
         )
+        # without a direction the lines state the numbers of both
+        for i, key in product(range(3), ("MIN_LIMIT", "HOME_OFFSET", "MAX_LIMIT")):
+            found = re.findall(rf"(?m)^{prefix}{key} = (\S+)", default[i])
+            found = found or re.findall(rf"(?m)^{key} = (\S+)", default[i])
+            assert found == re.findall(rf"(?m)^{key} = (\S+)", stated[i])
         for i, d in enumerate(calibration.robot.drives):
             assert low[i] <= homes[i] <= high[i]
             change = d.direction * (offsets_to_enter(calibration)[i] - ACTIVE[i])
@@ -506,8 +432,7 @@ def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):
     old = tuple(float(d.to_joint(d.upper + a)) for d, a in zip(drives, ACTIVE, strict=True))
     options = ExportOptions(module=False, latched=latched, home_offsets=old)
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     homes = home_offsets(files["joints.ini"])
     joints = [
         Joint(d.direction, d.upper / MM, h, h, latched=sign)
@@ -576,8 +501,7 @@ def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_p
     under, entered = under_tables
     options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED, home_offsets=entered)
     files = export_calibration(under, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
+    write_files(tmp_path, files)
     named = re.findall(r"^COMP_FILE = (\S+)\nCOMP_FILE_TYPE = 1$", files["kinematics.ini"], re.M)
     assert named == [f"joint_{i}_module.comp" for i in range(3)]
     assert "BACKLASH" not in files["kinematics.ini"]
@@ -760,20 +684,6 @@ SIDED = 1.0e-6
 """Part of the periodic errors that depends on the side, in drives: 0.2 µm each, [m]."""
 
 
-def test_lags_are_half_the_backlash(calibration, orthoglide):
-    lags = find_lags(calibration.robot, calibration.errors)
-    half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
-    assert lags == pytest.approx(half, rel=1e-9)
-    assert not find_lags(orthoglide, {}).any()
-
-
-def test_drives_without_backlash_change_no_program(calibration):
-    """Such sides divide motions, but do not move their ends."""
-    points = np.array([[10.0, 5.0, 0.0], [20.0, -5.0, 30.0]]) * MM
-    sides = ApproachSides(calibration, ACTIVE, np.zeros(3))
-    assert np.array_equal(sides.command(points, np.ones((2, 3))), points)
-
-
 def test_motions_are_divided_where_a_drive_reverses():
     """If the drives are the coordinates, a circle reverses each of two twice."""
 
@@ -789,18 +699,14 @@ def test_motions_are_divided_where_a_drive_reverses():
     at = (10e-3, 0.0, 0.0)
     arc = arc_about(at, at, (0.0, 0.0), plane=17, clockwise=False, turns=1)
     paths = Paths.from_motions(
-        [
-            Motion((0.0, 0.0, 0.0), at),
-            Motion(at, at, arc),
-            Motion(at, (0.0, 0.0, 5e-3)),
-        ]
+        [Motion((0.0, 0.0, 0.0), at), Motion(at, at, arc), Motion(at, (0.0, 0.0, 5e-3))]
     )
     sides = Plain()
     parts = split_at_reversals(paths, sides)
     assert parts.motion.tolist() == [0, *[1] * 4, 2]
     assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
     assert parts.sides.astype(int).tolist() == [
-        *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1]),
+        *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1])
     ]
     assert parts.reversed.all()
     assert sides.last.tolist() == [-1.0, 1.0, 1.0]

@@ -33,6 +33,7 @@ from orthocal.assessment.wording import MOST_ACTIONS, describe_actions, review
 from orthocal.calibration.assessment_record import Assessment, Decision, Place
 from orthocal.cli.correct import _with_comments
 from orthocal.export.urdf import _correct_origins, _find_twists
+from orthocal.io.files import write_files
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.observation.simulate import load_errors
 from orthocal.robot.parameters import ElementaryError
@@ -91,6 +92,7 @@ def test_corrections_of_offsets_alone_are_zero():
     found = calibrated(EXPERIMENT_2, **UNJUDGED)
     text = export_calibration(found, "table")["corrections.csv"]
     assert {r[f"d{k}_mm"] for r in csv.DictReader(io.StringIO(text)) for k in "xyz"} == {"0.000000"}
+    assert set(export_calibration(found, "urdf")) == {"orthoglide.urdf", "orthoglide.yaml"}
 
 
 def test_parameters_round_trip(full, tmp_path):
@@ -147,6 +149,7 @@ def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path):
 def disordered(root):
     """Calibration of two sessions, the one with active offsets given first."""
     plan = load_session(root / "examples/raw-cycles")
+    plan = plan.select([r for r in plan.readings if r.cycle == 1])
     truth = {f"{d.name}.offset": 1e-3 for d in plan.robot.drives}
     sessions = [
         simulate_session(plan.with_controller([v] * 3), truth, seed=k).session
@@ -232,16 +235,10 @@ def test_unknown_format_is_refused():
         export_calibration(calibrated(EXPERIMENT_2, **UNJUDGED), "xml")
 
 
-def written(files, folder):
-    folder.mkdir()
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    return folder
-
-
 def test_urdf_is_the_calibrated_machine(full, tmp_path):
     files = export_calibration(full, "urdf")
-    robot = load_robot(written(files, tmp_path / "real"))
+    write_files(tmp_path, files)
+    robot = load_robot(tmp_path)
     scales = {r["drive"]: r["scale_ppm"] for r in csv.DictReader(io.StringIO(files["scales.csv"]))}
     gain = 1.0 + 1e-6 * np.array([float(scales[d.name]) for d in robot.drives])
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))
@@ -263,17 +260,6 @@ def test_errors_of_effects_are_beside_the_urdf():
     )
     assert {r["unit"] for r in rows} == {"mm"}
     assert len(expected) >= 2
-
-
-def test_urdf_changes_in_origins_only(full):
-    text = export_calibration(full, "urdf")["orthoglide.urdf"]
-    before = full.robot.urdf.read_text()
-    origin = re.compile(r'(<origin) xyz="[^"]*" rpy="[^"]*"')
-    assert origin.sub(r"\1", text) == origin.sub(r"\1", before)
-    assert text != before
-    changed = [a for a, b in zip(text.splitlines(), before.splitlines(), strict=True) if a != b]
-    # unobservable errors are 0; visuals do not change
-    assert 20 < len(changed) < 40
 
 
 @pytest.mark.parametrize(
@@ -338,15 +324,6 @@ OTHERS = """\
 </gazebo>
 """
 """Elements named joint that are not joints of the robot."""
-
-
-def test_offset_displaces_the_origin_of_its_drive(tmp_path):
-    calibration = calibrated(EXPERIMENT_2, **UNJUDGED)
-    files = export_calibration(calibration, "urdf")
-    assert set(files) == {"orthoglide.urdf", "orthoglide.yaml"}
-    robot = load_robot(written(files, tmp_path / "real"))
-    tool = LoopClosure(robot).forward(robot.drive_zero)
-    assert np.abs(tool - calibration.machine.forward(robot.drive_zero)).max() < 1e-9
 
 
 def test_error_of_a_frame_on_a_moving_link_is_refused(orthoglide):

@@ -93,7 +93,7 @@ def check_program(program, lines, *, within, offset=(0.0, 0.0, 0.0)):
         last = ends[-1]
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(27))
 def test_written_program_is_near_the_corrected_path(seed):
     offset = (0.0, 0.0, 0.0) if seed % 3 else (12.5, -7.25, 3.0)
     within = [0.3e-6, 1e-6, 20e-6][seed % 3]
@@ -415,7 +415,7 @@ def test_memory_does_not_grow_with_the_program(monkeypatch):
             yield f"G1 X{i % 7} Y{i % 11}.5\n"
 
     peaks = []
-    for count in (300, 3000):
+    for count in (300, 1500):
         interpreter = Interpreter(axes=(0, 1, 2), offsets={})
         corrector = ProgramCorrector(interpreter, Bent(), file="p.ngc", within=WITHIN)
         tracemalloc.start()
@@ -528,21 +528,10 @@ def test_longest_written_line_is_what_linuxcnc_reads(line, end, tmp_path, monkey
 @pytest.mark.parametrize("off", [0.0, 1e-17, -1e-17, 1e-12, -1e-12])
 def test_a_full_circle_may_end_a_rounding_error_beside_its_start(clockwise, turns, off):
     """Both points are computed, such as in G91 and then in G90."""
-    arc = arc_about(
-        (10e-3, 0.0, 0.0),
-        (10e-3, off, 0.0),
-        (5e-3, 0.0),
-        clockwise=clockwise,
-        plane=17,
-        turns=turns,
-    )
-    assert arc.sweep == pytest.approx((-1 if clockwise else 1) * turns * 2.0 * np.pi)
-    short = arc_about(
-        (10e-3, 0.0, 0.0),
-        (10e-3, -1e-6 if clockwise else 1e-6, 0.0),
-        (5e-3, 0.0),
-        clockwise=clockwise,
-        plane=17,
-        turns=1,
-    )
-    assert abs(short.sweep) == pytest.approx(2e-4, rel=1e-6)
+
+    def sweep(y, turns):
+        start, end, centre = (10e-3, 0.0, 0.0), (10e-3, y, 0.0), (5e-3, 0.0)
+        return arc_about(start, end, centre, clockwise=clockwise, plane=17, turns=turns).sweep
+
+    assert sweep(off, turns) == pytest.approx((-1 if clockwise else 1) * turns * 2.0 * np.pi)
+    assert abs(sweep(-1e-6 if clockwise else 1e-6, 1)) == pytest.approx(2e-4, rel=1e-6)

@@ -11,6 +11,7 @@ import pytest
 
 from orthocal import load_robot, load_session
 from orthocal.errors import OrthocalError, RobotError, SessionError
+from orthocal.measurement.files import readings_checks, readings_file
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.robot.urdf import MOST_JOINTS, MOST_MOVING
@@ -168,10 +169,13 @@ def test_a_plan_with_too_many_readings_is_refused(root, tmp_path):
     assert f"expected at most {MOST_READINGS}" in message
 
 
-def test_too_many_readings_are_refused(session):
-    rows = "".join(f"yx,x_max,x_min,{i},0.42\n" for i in range(1, MOST_READINGS + 2))
+def test_too_many_readings_are_refused(session, monkeypatch):
+    most = MOST_READINGS // 10  # as promptly for each reading
+    for module in (readings_checks, readings_file):
+        monkeypatch.setattr(module, "MOST_READINGS", most)
+    rows = "".join(f"yx,x_max,x_min,{i},0.42\n" for i in range(1, most + 2))
     (session / "readings.csv").write_text(f"setup,posture,minus,cycle,reading_mm\n{rows}")
-    assert f"holds more than {MOST_READINGS} readings" in refusal(load_session, session)
+    assert f"holds more than {most} readings" in refusal(load_session, session)
 
 
 @pytest.mark.parametrize("key", ["resolution_mm", "sigma_mm"])

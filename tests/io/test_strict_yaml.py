@@ -54,7 +54,7 @@ def test_both_parsers_read_the_same(load):
 
 def test_mutated_documents(load):
     rng, good = random.Random(3), 0
-    for _ in range(600):
+    for _ in range(300):
         text = mutate(rng, rng.choice(DOCUMENTS))
         try:
             good += isinstance(load(text), dict)
@@ -62,7 +62,7 @@ def test_mutated_documents(load):
             continue
         except Exception as e:
             pytest.fail(f"{text!r}: {e!r}")
-    assert 200 < good < 500
+    assert 100 < good < 250
 
 
 @pytest.mark.parametrize(

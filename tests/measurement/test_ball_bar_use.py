@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 from commands import run_orthocal
 
-from orthocal import (
-    Machine,
-    assess_tool,
-    draw_errors,
-    load_calibration,
-    load_plan,
-    write_session,
-)
+from orthocal import Machine, assess_tool, draw_errors, load_calibration, load_plan, write_session
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters

@@ -13,59 +13,39 @@ from orthocal.measurement.importing.headings import (
     read_heading,
 )
 
+MEANINGS = {
+    "Setup": ("setup", None, None), "minus_posture": ("minus", None, None),
+    "Messwert": ("reading", None, None), "Messwert 2 [mm]": ("reading", 2, "mm"),
+    "2. Durchgang (µm)": ("reading", 2, "um"), "reading_mm_2": ("reading", 2, "mm"),
+    "reading_in_mm": ("reading", None, "mm"), "Wert in mm": ("reading", None, "mm"),
+    "reading (in inch)": ("reading", None, "inch"), "reading (in)": ("reading", None, "inch"),
+    "reading_in": ("reading", None, "inch"), "reading_in_2": ("reading", 2, "inch"),
+    "measured in": None, "reading [0.001 in]": ("reading", None, "thou"),
+    "reading_0.001 inch": ("reading", None, "thou"),
+    "reading in 0,001 inch": ("reading", None, "thou"),
+    "Messwert [1/100 mm]": ("reading", None, "hundredths"),
+    "Messwert in 1/100 mm": ("reading", None, "hundredths"),
+    "reading (0,01 mm)": ("reading", None, "hundredths"),
+    "reading 2 [hundredths of a mm]": ("reading", 2, "hundredths"),
+    "Ablesung in hundertstel mm": ("reading", None, "hundredths"),
+    "reading [1/1000 mm]": ("reading", None, "um"), "reading 0.001 mm": ("reading", None, "um"),
+    "reading [1/1000 in]": ("reading", None, "thou"), "reading [1/10 mm]": None,
+    "reading in 0.02 mm": None, "reading [10 um]": None, "reading mm um": None, "mm": None,
+    "1": ("reading", 1, None), "#3 mm": ("reading", 3, "mm"), "setup 2": None,
+    "temperature_C": ("temperature", None, None), "Temperatur [°C]": ("temperature", None, None),
+    "temperature (deg F)": ("temperature", None, None),
+    "Machine temperature in °F": ("temperature", None, None), "temp": ("temperature", None, None),
+    "Temp. [°C]": ("temperature", None, None), "Wdh.": ("cycle", None, None), "reading [°C]": None,
+    "Anfahrrichtung": ("approach", None, None), "Datum und Uhrzeit": ("time", None, None),
+    "setup [mm]": None, "x" * 300: None,
+}  # fmt: skip
+"""Role, cycle and unit of headings."""
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("Setup", ("setup", None, None)),
-        ("minus_posture", ("minus", None, None)),
-        ("Messwert", ("reading", None, None)),
-        ("Messwert 2 [mm]", ("reading", 2, "mm")),
-        ("2. Durchgang (µm)", ("reading", 2, "um")),
-        ("reading_mm_2", ("reading", 2, "mm")),
-        ("reading_in_mm", ("reading", None, "mm")),
-        ("Wert in mm", ("reading", None, "mm")),
-        ("reading (in inch)", ("reading", None, "inch")),
-        ("reading (in)", ("reading", None, "inch")),
-        ("reading_in", ("reading", None, "inch")),
-        ("reading_in_2", ("reading", 2, "inch")),
-        ("measured in", None),
-        ("reading [0.001 in]", ("reading", None, "thou")),
-        ("reading_0.001 inch", ("reading", None, "thou")),
-        ("reading in 0,001 inch", ("reading", None, "thou")),
-        ("Messwert [1/100 mm]", ("reading", None, "hundredths")),
-        ("Messwert in 1/100 mm", ("reading", None, "hundredths")),
-        ("reading (0,01 mm)", ("reading", None, "hundredths")),
-        ("reading 2 [hundredths of a mm]", ("reading", 2, "hundredths")),
-        ("Ablesung in hundertstel mm", ("reading", None, "hundredths")),
-        ("reading [1/1000 mm]", ("reading", None, "um")),
-        ("reading 0.001 mm", ("reading", None, "um")),
-        ("reading [1/1000 in]", ("reading", None, "thou")),
-        ("reading [1/10 mm]", None),
-        ("reading in 0.02 mm", None),
-        ("reading [10 um]", None),
-        ("reading mm um", None),
-        ("mm", None),
-        ("1", ("reading", 1, None)),
-        ("#3 mm", ("reading", 3, "mm")),
-        ("setup 2", None),
-        ("temperature_C", ("temperature", None, None)),
-        ("Temperatur [°C]", ("temperature", None, None)),
-        ("temperature (deg F)", ("temperature", None, None)),
-        ("Machine temperature in °F", ("temperature", None, None)),
-        ("temp", ("temperature", None, None)),
-        ("Temp. [°C]", ("temperature", None, None)),
-        ("Wdh.", ("cycle", None, None)),
-        ("reading [°C]", None),
-        ("Anfahrrichtung", ("approach", None, None)),
-        ("Datum und Uhrzeit", ("time", None, None)),
-        ("setup [mm]", None),
-        ("x" * 300, None),
-    ],
-)
-def test_meaning_of_a_heading(text, expected):
+
+@pytest.mark.parametrize("text", MEANINGS)
+def test_meaning_of_a_heading(text):
     heading = read_heading(text)
-    assert (heading and (heading.role, heading.cycle, heading.unit)) == expected
+    assert (heading and (heading.role, heading.cycle, heading.unit)) == MEANINGS[text]
 
 
 @pytest.mark.parametrize(

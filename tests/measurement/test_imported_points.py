@@ -81,10 +81,7 @@ def test_names_of_postures_and_decimal_commas(session, tmp_path):
 
 def test_commanded_points_and_inches(session, tmp_path):
     folder, points = session
-    heading = [
-        *(f"nominal {k} (mm)" for k in "xyz"),
-        *(f"measured {k} (inch)" for k in "xyz"),
-    ]
+    heading = [*(f"nominal {k} (mm)" for k in "xyz"), *(f"measured {k} (inch)" for k in "xyz")]
     rows = [[*map(str, c), *numbers(p, unit=25.4)] for c, p in zip(GRID, points, strict=True)]
     file = table(tmp_path / "t.csv", heading, rows, separator="\t")
     result = import_readings(file, folder)

@@ -151,14 +151,14 @@ def test_noise_is_estimated_for_each_session(root):
 
 
 def test_deviations_of_mixed_sessions_are_those_of_many(root):
-    """Offsets from a coarse and a fine session: 120 z scores, as calibrations have them.
+    """Offsets from a coarse and a fine session: 60 z scores, as calibrations have them.
 
-    Their root mean square has a standard deviation of 1/√240 = 0.065 around 1.
+    Their root mean square has a standard deviation of 1/√120 = 0.09 around 1.
     """
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
     options, scores = SolverOptions(solver="variable-projection"), []
-    for seed in range(40):
+    for seed in range(20):
         pair = [
             simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session
             for i, s in enumerate((40e-6, 5e-6))
@@ -185,7 +185,7 @@ def test_both_solvers_weigh_gauges_alike(root):
         replace(s, readings=tuple(r for r in s.readings if r.cycle == 1 and r.setup[1] == "x"))
         for s in pair
     ]
-    problem = build_problem(join_sessions(pair), model="lengths")
+    problem = build_problem(join_sessions(pair), model="offsets")
     problem = problem.with_noise_ratio(np.repeat([1.0, 0.25], problem.observations.size // 2))
     options = SolverOptions(loss=Loss("huber"), hessian="exact")
     ours = VariableProjection(problem, options=options).solve(sigma=2e-5)

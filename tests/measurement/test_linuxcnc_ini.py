@@ -28,12 +28,7 @@ from orthocal import (
 )
 from orthocal.assessment.controller_entries import find_backlash
 from orthocal.cli.sheet import note_contradictions
-from orthocal.effects.compensation import (
-    JointTrim,
-    compensates_alike,
-    home_positions,
-    with_homes,
-)
+from orthocal.effects.compensation import JointTrim, compensates_alike, home_positions, with_homes
 from orthocal.effects.loading import with_effects
 from orthocal.export.linuxcnc import entered_lines
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
@@ -254,15 +249,24 @@ def with_lines(text, exported):
     return text
 
 
-def export(folder, one, out, *words):
-    return run_orthocal(
-        folder, "export", one, "--to", "linuxcnc", "--offsets", "--out", out, *words
-    )
+def run(folder, command, *words, code=0):
+    """A command, and that it ends as expected."""
+    done = run_orthocal(folder, command, *words)
+    assert done.returncode == code, done.stderr
+    return done
+
+
+def export(folder, one, out, *words, code=0):
+    to = ("--to", "linuxcnc", "--offsets", "--out", out)
+    return run(folder, "export", one, *to, *words, code=code)
+
+
+def again(folder, one, out, *words):
+    return run(folder, "again", one, "--out", out, *words)
 
 
 def test_export_refuses_the_file_of_another_controller(folder, one):
-    done = export(folder, one, "home", "--ini", folder / "machine.ini")
-    assert done.returncode == 2
+    done = export(folder, one, "home", "--ini", folder / "machine.ini", code=2)
     assert "machine.ini" in done.stderr
     message = " ".join(done.stderr.split())
     assert "JOINT_0 has BACKLASH 0.031 mm instead of BACKLASH 0 or none" in message
@@ -271,19 +275,17 @@ def test_export_refuses_the_file_of_another_controller(folder, one):
 
 def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
     by_file = export(folder, one, "file", "--ini", plain)
-    assert by_file.returncode == 0, by_file.stderr
     assert "Assumed" not in by_file.stderr
     stated = ["--home-offset", "352.5,340,-3.25", "--latched=-,+,+"]
-    assert export(folder, one, "stated", *stated).returncode == 0
+    export(folder, one, "stated", *stated)
     other = ["--home-offset", "352.5,340,-3.25", "--latched=+,+,+"]
-    assert export(folder, one, "other", *other).returncode == 0
+    export(folder, one, "other", *other)
     lines = [(folder / name / "joints.ini").read_text() for name in ("file", "stated", "other")]
     assert lines[0] == lines[1] != lines[2]
     for name, expected in (("file", (-1, 1, 1)), ("other", (1, 1, 1))):  # for the next commands
         path = folder / name / "joints.ini"
         assert read_controller_joints(path, load_calibration(one).robot).latched == expected
-    twice = export(folder, one, "twice", "--ini", plain, "--latched", "+,+,+")
-    assert twice.returncode == 2
+    twice = export(folder, one, "twice", "--ini", plain, "--latched", "+,+,+", code=2)
     assert "--latched" in twice.stderr
 
 
@@ -293,9 +295,8 @@ def test_a_fragment_of_changes_states_no_home_offset(folder, one, plain):
     (folder / "changes.ini").write_text("\n".join(lines))
     home = ["--home-offset", "352.5,340,-3.25"]
     for name, words in (("no-file", []), ("stated", home)):
-        assert export(folder, one, name, *words).returncode == 0
-        done = export(folder, one, f"{name}-ini", "--ini", "changes.ini", *words)
-        assert done.returncode == 0, done.stderr
+        export(folder, one, name, *words)
+        export(folder, one, f"{name}-ini", "--ini", "changes.ini", *words)
         texts = [(folder / n / "joints.ini").read_text() for n in (name, f"{name}-ini")]
         entered = [re.findall(r"^(?:# )?HOME_OFFSET = .*", text, re.M) for text in texts]
         assert entered[0] == entered[1]
@@ -308,7 +309,7 @@ def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
     (folder / "narrow.ini").write_text(plain.read_text().replace("[JOINT_1]\n", own))
     limits = []
     for name in ("plain", "narrow"):
-        assert export(folder, one, name, "--ini", folder / f"{name}.ini").returncode == 0
+        export(folder, one, name, "--ini", folder / f"{name}.ini")
         text = (folder / name / "joints.ini").read_text()
         found = re.findall(r"^(?:MIN|MAX)_LIMIT = (\S+)", text, re.M)
         limits.append(np.array(found, dtype=float).reshape(3, 2))
@@ -317,7 +318,7 @@ def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
     change = limits[1] - limits[0]
     assert limits[0][1] == pytest.approx((120.0, 390.0), abs=1.0)
     offset = limits[0][1, 0] - 120.0
-    assert export(folder, one, "none", "--home-offset", "352.5,340,-3.25").returncode == 0
+    export(folder, one, "none", "--home-offset", "352.5,340,-3.25")
     page = " ".join((folder / "none/README.md").read_text().split())
     assert float(re.search(r"change by: .* JOINT_1 (\S+) mm", page)[1]) == pytest.approx(offset)
     assert limits[1][1, 0] == pytest.approx(160.0 + offset, abs=1e-3)
@@ -325,25 +326,10 @@ def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
     assert not change.any()
 
 
-def test_latching_is_positive_by_default_and_said_to_be(folder, one, plain):
-    home = ["--home-offset", "352.5,340,-3.25"]
-    default = export(folder, one, "default", *home)
-    assert "Assumed: HOME_LATCH_VEL of all joints is positive. " in default.stderr
-    lines = [v for v in plain.read_text().splitlines() if not v.startswith("HOME_LATCH_VEL")]
-    (folder / "unlatched.ini").write_text("\n".join(lines))
-    by_file = export(folder, one, "unlatched", "--ini", folder / "unlatched.ini")
-    assert "unlatched.ini does not state it" in by_file.stderr
-    assert "--ini" not in by_file.stderr
-    stated = export(folder, one, "stated", *home, "--latched", "+,+,+")
-    assert "Assumed" not in stated.stderr
-    texts = [(folder / name / "joints.ini").read_text() for name in ("default", "stated")]
-    entered = [re.findall(r"^HOME_OFFSET = (\S+)", text, re.M) for text in texts]
-    assert entered[0] == entered[1]
-    assert len(entered[0]) == 3
-
-
 def test_the_assumed_direction_of_a_single_joint_is_named(folder, one, plain):
     """If it is positive by assumption, the other number is beside it; an option states it."""
+    done = export(folder, one, "default", "--home-offset", "352.5,340,-3.25")
+    assert "Assumed: HOME_LATCH_VEL of all joints is positive. " in done.stderr
     text = plain.read_text().replace("HOME_LATCH_VEL = 0.5", "")
     (folder / "partial.ini").write_text(text)
     done = export(folder, one, "assumed", "--ini", "partial.ini")
@@ -351,30 +337,30 @@ def test_the_assumed_direction_of_a_single_joint_is_named(folder, one, plain):
     assert "Assumed: HOME_LATCH_VEL of JOINT_2 is positive (partial.ini does not state" in note
     assert "--ini FILE" not in note
     assert "The sign + of JOINT_2 is assumed" in (folder / "assumed/README.md").read_text()
-    lines = (folder / "assumed/joints.ini").read_text()
+    path = folder / "assumed/joints.ini"
+    assert read_controller_joints(path, load_calibration(one).robot).latched == (0, 0, 0)
+    lines = path.read_text()
     assert lines.count("# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET") == 1
     done = export(folder, one, "stated", "--ini", "partial.ini", "--latched=-,+,-")
     assert "Assumed" not in done.stderr
     stated = (folder / "stated/joints.ini").read_text()
     (other,) = re.findall(r"negative: (HOME_OFFSET = .*)", lines)
     assert re.findall(r"(?m)^HOME_OFFSET = .*", stated)[2] == other
-    done = export(folder, one, "against", "--ini", "partial.ini", "--latched=+,+,-")
-    assert done.returncode == 2
+    done = export(folder, one, "against", "--ini", "partial.ini", "--latched=+,+,-", code=2)
     assert "--latched: contradicts the HOME_LATCH_VEL of JOINT_0" in done.stderr
 
 
 def test_again_states_the_backlash_of_the_file(folder, one, plain):
-    assert export(folder, one, "home", "--ini", plain).returncode == 0
-    words = ["again", one, "--out", folder / "second", "--ini", folder / "home/joints.ini"]
-    done = run_orthocal(folder, *words)
-    assert done.returncode == 0, done.stderr
+    export(folder, one, "home", "--ini", plain)
+    ini = folder / "home/joints.ini"
+    done = again(folder, one, "second", "--ini", ini)
     second, result = load_plan(folder / "second"), load_calibration(one)
     entered = [trim.backlash for trim in second.compensation]
     identified = [result.errors[f"{d.name}.backlash"] for d in second.robot.drives]
     assert entered == pytest.approx(np.round(identified, 6), abs=1e-12)
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
     assert "instead of" not in done.stderr
-    assert f"The lines of {words[-1]} contain them: enter these lines" in done.stdout
+    assert f"The lines of {ini} contain them: enter these lines" in done.stdout
     assert "HOME_OFFSET" not in done.stdout
 
 
@@ -392,15 +378,14 @@ def program_joints(folder):
 
 def test_again_names_motions_beyond_the_soft_limits_of_the_file(folder, one, plain):
     """Also those of an approach: the posture itself may be within the limits."""
-    run_orthocal(folder, "again", one, "--out", "free", "--ini", plain)
+    again(folder, one, "free", "--ini", plain)
     joints = program_joints(folder / "free")
     highest, lowest = joints[:, 1].max(), joints[:, 1].min()
     for excess in (-0.01, 0.01):
         own = f"[JOINT_1]\nMIN_LIMIT = {lowest + excess}\nMAX_LIMIT = {highest - excess}\n"
         (folder / "narrow.ini").write_text(plain.read_text().replace("[JOINT_1]\n", own))
         out = "beyond" if excess > 0 else "within"
-        done = run_orthocal(folder, "again", one, "--out", out, "--ini", "narrow.ini")
-        assert done.returncode == 0
+        done = again(folder, one, out, "--ini", "narrow.ini")
         assert ("narrow.ini: the controller refuses" in done.stderr) == (excess > 0)
     named = re.findall(
         r"JOINT_(\d) \((\w+)\), (M.._LIMIT) (\S+) mm: (.*) reaches (\S+) mm", done.stderr
@@ -419,20 +404,18 @@ def test_again_names_motions_beyond_the_soft_limits_of_the_file(folder, one, pla
 
 def test_again_says_what_differs_in_the_file_of_another_calibration(folder, one, plain):
     """HOME_OFFSET by the comment of exported lines, BACKLASH by its values."""
-    assert export(folder, one, "home", "--ini", plain).returncode == 0
+    export(folder, one, "home", "--ini", plain)
     lines = (folder / "home/joints.ini").read_text()
     (stated,) = re.findall(r"(?m)^# controller: \{offsets_mm: \[(\S+), .*\]\}$", lines)
     (backlash, *_) = re.findall(r"(?m)^BACKLASH = (\S+)$", lines)
     other = f"{float(stated) + 0.1:.6g}"
     (folder / "other.ini").write_text(lines.replace(f"[{stated},", f"[{other},"))
-    done = run_orthocal(folder, "again", one, "--out", "second", "--ini", "other.ini")
-    assert done.returncode == 0
+    done = again(folder, one, "second", "--ini", "other.ini")
     text = " ".join(done.stderr.split())
     assert f"x_slide {float(other):+.3f} mm instead of {float(stated):+.3f} mm" in text
     assert "y_slide" not in text
     assert "JOINT_" not in text
-    done = run_orthocal(folder, "again", one, "--out", "third", "--ini", "plain.ini")
-    assert done.returncode == 0
+    done = again(folder, one, "third", "--ini", "plain.ini")
     text = " ".join(done.stderr.split())
     expected = f"JOINT_0 has BACKLASH 0 or none instead of BACKLASH {float(backlash):.3f} mm"
     assert expected in text
@@ -442,8 +425,7 @@ def test_again_says_what_differs_in_the_file_of_another_calibration(folder, one,
 
 def test_again_states_the_tables_of_the_file(folder, one):
     """The tables are copied beside the new session."""
-    done = run_orthocal(folder, "again", one, "--out", "second", "--ini", "machine.ini")
-    assert done.returncode == 0, done.stderr
+    done = again(folder, one, "second", "--ini", "machine.ini")
     first, _, last = load_plan(folder / "second").compensation
     assert first.backlash == pytest.approx(0.031 * MM)
     expected = np.array([[0.0, 0.01, -0.02], [100.0, 0.03, -0.04]]) * MM
@@ -453,8 +435,7 @@ def test_again_states_the_tables_of_the_file(folder, one):
 
 def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     """What `calibrate` says to enter is what the next session is read with."""
-    done = run_orthocal(folder, "again", one, "--out", "second")
-    assert done.returncode == 0, done.stderr
+    done = again(folder, one, "second")
     second = load_plan(folder / "second")
     entries = load_calibration(one).assessment.backlash
     assert any(e.change for e in entries)
@@ -471,7 +452,7 @@ def test_home_offsets_are_written_and_read(folder, orthoglide):
     write_session(replace(plan, compensation=trims), folder / "written")
     controller = yaml.safe_load((folder / "written/session.yaml").read_text())["controller"]
     assert controller["home_offset_mm"] == list(HOMES)
-    assert run_orthocal(folder, "sheet", "written").returncode == 0
+    run(folder, "sheet", "written")
     sheet = (folder / "written/sheet.html").read_text()
     assert "HOME_OFFSET is as session.yaml states: x_slide 352.5 mm, y_slide 340.0 mm" in sheet
     read = load_plan(folder / "written").compensation
@@ -481,7 +462,7 @@ def test_home_offsets_are_written_and_read(folder, orthoglide):
 
 def test_export_begins_with_the_home_offsets_of_the_session(folder, at_home, plain):
     for name, words in (("session", ["--latched=-,+,+"]), ("file", ["--ini", plain])):
-        assert export(folder, at_home, name, *words).returncode == 0
+        export(folder, at_home, name, *words)
     texts = [(folder / name / "joints.ini").read_text() for name in ("session", "file")]
     entered = [re.findall(r"(?m)^HOME_OFFSET = .*", text) for text in texts]
     assert entered[0] == entered[1]
@@ -499,7 +480,7 @@ def test_the_next_commands_of_linuxcnc_export_first(one, at_home):
 
 
 def test_offsets_are_not_entered_twice(folder, at_home, plain):
-    assert export(folder, at_home, "home", "--ini", plain).returncode == 0
+    export(folder, at_home, "home", "--ini", plain)
     lines = (folder / "home/joints.ini").read_text()
     new = re.search(r"(?m)^HOME_OFFSET = (\S+)", lines)[1]
     entered = re.sub("BACKLASH = .*", "", with_lines(plain.read_text(), lines))
@@ -508,9 +489,8 @@ def test_offsets_are_not_entered_twice(folder, at_home, plain):
         ("entered.ini", ["--ini", "entered.ini"]),
         ("--home-offset", ["--home-offset", f"{new},340,-3.25"]),
     ):
-        done = export(folder, at_home, "twice", *words)
+        done = export(folder, at_home, "twice", *words, code=2)
         message = " ".join(done.stderr.split())
-        assert done.returncode == 2
         assert f"{name}: has other HOME_OFFSET" in message
         expected = f"JOINT_0 has HOME_OFFSET {float(new):.4f} mm instead of 352.5000 mm"
         assert expected in message
@@ -522,26 +502,27 @@ def test_plans_keep_the_home_offsets_of_their_offsets(folder, at_home, plain):
     """Offsets that were entered since the session was measured would be entered twice."""
     write_session(restore_session(load_calibration(at_home)), folder / "first")
     (folder / "moved.ini").write_text(plain.read_text().replace("340", "340.5"))
-    for out, words in (("plain", ["--ini", plain]), ("moved", ["--ini", "moved.ini"])):
-        done = run_orthocal(folder, "plan", "first", "--add", "1", "--out", out, *words)
-        assert done.returncode == 0, done.stderr
-        stated = home_positions(load_plan(folder / out).compensation)
-        assert np.array(stated) / MM == pytest.approx(HOMES)
-        sheet = run_orthocal(folder, "sheet", out, "--force", *words)
-        for text in (done.stderr, sheet.stderr):
-            expected = "JOINT_1 has HOME_OFFSET 340.5000 mm instead of 340.0000 mm."
-            assert (expected in " ".join(text.split())) == (out == "moved")
+    words = ("plan", "first", "--add", "1", "--out", "second")
+    planned = run(folder, *words, "--ini", "moved.ini")
+    stated = home_positions(load_plan(folder / "second").compensation)
+    assert np.array(stated) / MM == pytest.approx(HOMES)
+    moved, same = (
+        run_orthocal(folder, "sheet", "second", "--force", "--ini", ini)
+        for ini in ("moved.ini", plain)
+    )
+    expected = "JOINT_1 has HOME_OFFSET 340.5000 mm instead of 340.0000 mm."
+    found = [expected in " ".join(done.stderr.split()) for done in (planned, moved, same)]
+    assert found == [True, True, False]
 
 
 def test_again_compares_home_offsets(folder, at_home, plain):
     """With those that the calibration says to enter."""
-    assert export(folder, at_home, "home", "--ini", plain).returncode == 0
+    export(folder, at_home, "home", "--ini", plain)
     lines = (folder / "home/joints.ini").read_text()
     (folder / "entered.ini").write_text(with_lines(plain.read_text(), lines))
     found = [float(v) for v in re.findall(r"(?m)^HOME_OFFSET = (\S+)", lines)]
     for k, ini in enumerate(("entered.ini", "home/joints.ini")):  # the latter has a comment on it
-        done = run_orthocal(folder, "again", at_home, "--out", f"second-{k}", "--ini", ini)
-        assert done.returncode == 0
+        done = again(folder, at_home, f"second-{k}", "--ini", ini)
         assert f"The lines of {ini} contain them" in " ".join(done.stdout.split())
         assert "instead of" not in done.stderr
         stated = home_positions(load_plan(folder / f"second-{k}").compensation)
@@ -549,7 +530,7 @@ def test_again_compares_home_offsets(folder, at_home, plain):
     # a line that was not entered
     entered = (folder / "entered.ini").read_text()
     (folder / "partly.ini").write_text(re.sub("BACKLASH = .*\n", "", entered, count=1))
-    done = run_orthocal(folder, "again", at_home, "--out", "partly", "--ini", "partly.ini")
+    done = again(folder, at_home, "partly", "--ini", "partly.ini")
     text = " ".join(done.stderr.split())
     assert "says to enter, but JOINT_0 has BACKLASH 0 or none instead of BACKLASH 0." in text
     assert "has HOME_OFFSET 3" not in text
@@ -560,8 +541,7 @@ def test_again_compares_home_offsets(folder, at_home, plain):
     change = result.robot.drives[0].direction * round(result.assessment.entries[0].enter, 6)
     own = HOMES[0] + change / MM  # without BACKLASH
     for ini, number in (("wrong.ini", found[0]), (plain, own)):
-        done = run_orthocal(folder, "again", at_home, "--out", "x", "--force", "--ini", ini)
-        assert done.returncode == 0
+        done = again(folder, at_home, "x", "--force", "--ini", ini)
         assert "The lines of" not in done.stdout
         text = " ".join(done.stderr.split())
         assert "does not have the offsets that the new session states. With its" in text
@@ -580,7 +560,7 @@ def test_home_offsets_to_enter_depend_on_the_backlash_of_the_file(folder, at_hom
         new = home + drive.direction * entry.enter / MM
         text = text.replace(f"HOME_OFFSET = {home:g}", f"HOME_OFFSET = {new:.4f}")
     (folder / "own.ini").write_text(text)
-    done = run_orthocal(folder, "again", at_home, "--out", "second", "--ini", "own.ini")
+    done = again(folder, at_home, "second", "--ini", "own.ini")
     assert "The lines of own.ini contain them" in " ".join(done.stdout.split())
     assert "HOME_OFFSET" not in done.stderr
     assert "BACKLASH 0 or none instead of" in " ".join(done.stderr.split())
@@ -590,7 +570,7 @@ def test_home_offsets_to_enter_depend_on_the_backlash_of_the_file(folder, at_hom
 def test_again_states_home_offsets_that_it_knows(folder, at_home):
     """Half of a changed backlash has the sign of HOME_LATCH_VEL, which only a file states."""
     result = load_calibration(at_home)
-    done = run_orthocal(folder, "again", at_home, "--out", "second")
+    done = again(folder, at_home, "second")
     assert "To compare HOME_OFFSET, add --ini" in done.stderr
     assert home_positions(load_plan(folder / "second").compensation) is None
     trims = with_homes([JointTrim(e.enter) for e in find_backlash(result)], np.array(HOMES) * MM)

@@ -22,7 +22,7 @@ from orthocal.measurement.importing.long_table import make_long_table
 
 NAMES = {"setup": ["xy", "yx"], "posture": ["zero", "x_max", "x_-40"]}
 PLACES = [(s, p) for s in NAMES["setup"] for p in NAMES["posture"]]
-EXAMPLES = int(os.environ.get("ORTHOCAL_EXAMPLES", "200"))
+EXAMPLES = int(os.environ.get("ORTHOCAL_EXAMPLES", "120"))
 """Number of examples; more in a long run."""
 
 HEADINGS = {
@@ -158,7 +158,7 @@ def test_every_dialect_with_a_decisive_number_is_read(separator, decimal):
         assert [*found.values()] == [value / 1000 for value in DECISIVE]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(readings, min_size=1, max_size=6), st.booleans(), st.sampled_from([*UNITS]))
 def test_numbers_of_a_workbook_are_imported_exactly(values, as_text, unit):
     book = openpyxl.Workbook()

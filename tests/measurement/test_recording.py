@@ -27,7 +27,7 @@ from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.session.session import Conditions
 from orthocal.units import MM
 
-STEPS = (*range(3, 11, 2), *range(40, 48))
+STEPS = (3, 7, *range(20, 26))
 """Steps of writing at which a recording is killed: some of its start, all of several readings."""
 FORK = multiprocessing.get_context("fork")
 
@@ -97,19 +97,6 @@ def test_a_plan_writes_over_no_other_readings(plan):
     assert (plan / "readings.csv").read_text().endswith("yx,zero,0.1\n")
 
 
-def test_what_is_read_is_on_disk_at_once_and_all_of_it_makes_a_session(plan):
-    with open_recording(plan) as r:
-        for i in range(12):
-            assert r.next_empty() == i
-            r.read(i, (0.01 * i - 0.05) * MM)
-            assert values(plan)[r.rows[i].key[0], r.rows[i].posture, r.rows[i].cycle] == round(
-                0.01 * i - 0.05, 9
-            )
-        assert r.next_empty() is None
-    session = load_session(plan)
-    assert [v / MM for v in session.values] == pytest.approx(0.01 * np.arange(12) - 0.05)
-
-
 def test_what_was_measured_is_a_session_of_the_rows_that_were_read(plan):
     with open_recording(plan) as r:
         for i in (1, 3, 4):
@@ -162,21 +149,7 @@ def test_repeating_dropping_emptying_and_correcting(plan):
     assert ("yx", "x_max", 1) not in found
     lines = (plan / f"readings.csv{SUFFIX}").read_text().splitlines()
     said = [json.loads(line).get("done") for line in lines]
-    assert said == [
-        *(None, "read", "added", "read", "read", "dropped", "read", "emptied", None),
-    ]
-
-
-def test_added_rows_are_asked_for_with_their_setup(plan):
-    with open_recording(plan) as r:
-        r.read(0, 0.1 * MM)
-        added = r.repeat(0)
-        of_setup = [i for i, row in enumerate(r.rows) if row.setup == "yx"]
-        for i in of_setup[1:-1]:
-            r.read(i, 0.0)
-        assert r.next_empty() == added == of_setup[-1]
-        before = [row.line for row in r.rows]
-    assert [row.line for row in load_plan(plan).readings] == before
+    assert said == [*(None, "read", "added", "read", "read", "dropped", "read", "emptied", None)]
 
 
 def test_the_closing_reading_follows_added_rows_in_record_and_on_the_sheet(plan):
@@ -236,20 +209,13 @@ def test_a_repeated_difference_gets_a_cycle_that_holds_no_readings_of_another_fo
     assert [r.cycle for r in load_plan(plan).readings] == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("value", [5.01, -7.0, 1234.0])
+@pytest.mark.parametrize("value", [5.01, -7.0, 1234.0, np.nan])
 def test_what_the_gauge_cannot_show_is_not_taken(plan, value):
     with open_recording(plan) as r:
         with pytest.raises(SessionError, match=r"yx zero: reading_mm is"):
             r.read(0, value * MM)
         assert r.missing[0] == 0
     load_plan(plan)
-
-
-def test_a_reading_is_a_number(plan):
-    with open_recording(plan) as r:
-        with pytest.raises(SessionError, match="yx zero: reading_mm is nan; expected a number"):
-            r.read(0, np.nan)
-        assert r.missing[0] == 0
 
 
 def test_the_only_row_stays(plan):
@@ -517,26 +483,17 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     assert sorted(set(restored)) == [0, 1]
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("0.12", 0.12),
-        (" -0,35 ", -0.35),
-        ("−0.35", -0.35),
-        ("– 1,5", -1.5),
-        ("+.5", 0.5),
-        ("5.", 5.0),
-        ("0,123", 0.123),
-        ("1.234", 1.234),
-        ("1,23", 1.23),
-        ("1,2345", 1.2345),
-        ("0.12 mm", 0.12),
-        ("0,12MM", 0.12),
-        ("-0", 0.0),
-    ],
-)
-def test_numbers_as_people_type_them(text, value):
-    assert parse_typed_reading(text) / MM == pytest.approx(value, abs=1e-15)
+TYPED = {
+    "0.12": 0.12, " -0,35 ": -0.35, "−0.35": -0.35, "– 1,5": -1.5, "+.5": 0.5, "5.": 5.0,
+    "0,123": 0.123, "1.234": 1.234, "1,23": 1.23, "1,2345": 1.2345, "0.12 mm": 0.12, "0,12MM": 0.12,
+    "-0": 0.0,
+}  # fmt: skip
+"""Numbers as people type them, [mm]."""
+
+
+@pytest.mark.parametrize("text", TYPED)
+def test_numbers_as_people_type_them(text):
+    assert parse_typed_reading(text) / MM == pytest.approx(TYPED[text], abs=1e-15)
     assert not np.signbit(parse_typed_reading("-0"))
 
 

@@ -162,19 +162,6 @@ def test_a_trace_comes_from_a_file_and_goes_into_a_session(plan, there_and_back,
     assert all(isinstance(r.conditions, Conditions) for r in again.readings)
 
 
-def test_the_command_writes_a_session(plan, there_and_back, tmp_path):
-    file = write_trace(there_and_back, tmp_path)
-    words = ("trace", plan.path, f"xy={file}", "--out", tmp_path / "s")
-    done = orthocal(*words)
-    assert done.returncode == 0
-    assert "3000 samples" in done.stderr
-    assert "not used" not in done.stderr
-    assert orthocal(*words).returncode == 2  # it would overwrite
-    assert orthocal(*words[:2], "xy.csv", *words[3:]).returncode == 2
-    session = load_session(tmp_path / "s")
-    assert {r.setup for r in session.readings} == {"xy"}
-
-
 def test_bins_with_few_samples_are_counted(plan, there_and_back, tmp_path):
     """Two stretches of the path have one sample in ten, as after a lost connection."""
     sample = np.arange(3000)
@@ -196,6 +183,11 @@ def test_bins_with_few_samples_are_counted(plan, there_and_back, tmp_path):
         "used: a bin needs 8 samples at different positions"
     )
     assert sentence in done.stderr
+    assert f"{len(trace.values)} samples" in done.stderr
+    assert {r.setup for r in load_session(tmp_path / "s").readings} == {"xy"}
+    words = ("trace", plan.path, f"xy={file}", "--out", tmp_path / "s")
+    assert orthocal(*words).returncode == 2  # it would overwrite
+    assert orthocal(*words[:2], "xy.csv", *words[3:]).returncode == 2
 
 
 @pytest.mark.parametrize(

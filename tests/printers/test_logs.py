@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import identified
 from commands import run_orthocal
 from simulated_printer import Firmware, nominal, rings, write_log, write_settings
 
-from orthocal import calibrate, join_sessions, load_session
+from orthocal import load_session
 from orthocal.cli.files import require_not_calibrated
 from orthocal.errors import SessionError
 from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
@@ -227,24 +228,9 @@ def test_reports_of_reprapfirmware(probed):
     assert np.abs(travel - expected.travel(nozzle) * MM).max() < 1e-9
 
 
-ABSORBING = (
-    "M851 Z0\nM665 L180.19 R91.5 H240 A6.348 B-2.297 C-3.480 X0 Y0 Z0\nM666 X0 Y0 Z0\n"
-    "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.2\nBed X: 0 Y: 50 Z: 0.3\n"
-)
-"""Trims of the rods as in Marlin #14910."""
-
-
-def test_trims_that_absorb_other_errors_are_named(probed, tmp_path):
-    log = probed(ABSORBING)
-    assert "absorb" in log.notes[0]
-    assert "+6.158" in log.notes[0]
-    session = import_printer_log(tmp_path / "log.txt").session
-    lengths = [leg.length for leg in session.robot.legs.values()]
-    assert lengths == pytest.approx([0.18038] * 3, abs=1e-5)
-
-
 KLIPPER = write_log("klipper", nominal(), rings()[:4], np.zeros(4), -1.0)
 MARLIN = write_log("marlin", nominal(), rings()[:4], np.zeros(4))
+CFG = write_settings("klipper", nominal())
 RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
 
 
@@ -264,21 +250,9 @@ RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
         (MARLIN.replace("Bed X: -", "Bed -"), "log.txt", "probed points"),
         (MARLIN + "M665 L280.0 R141.5 H300.0\n", "log.txt:", "R is 141.5, and 140 before"),
         (KLIPPER.replace("#*# height1 =", "#*# other ="), "height1", "missing"),
-        (
-            write_settings("klipper", nominal()) + "probe at 0.0,0.0 is z=0,634\n" * 7,
-            "log.txt:",
-            "decimal comma",
-        ),
-        (
-            write_settings("klipper", nominal()) + "probe at 0,000,0,000 is z=0,634\n",
-            "log.txt:",
-            "with a decimal point",
-        ),
-        (
-            write_settings("klipper", nominal()) + "probe: at 0.0,0.0 bed will contact at z=\n",
-            "log.txt:",
-            "contact at z='",
-        ),
+        (CFG + "probe at 0.0,0.0 is z=0,634\n" * 7, "log.txt:", "decimal comma"),
+        (CFG + "probe at 0,000,0,000 is z=0,634\n", "log.txt:", "with a decimal point"),
+        (CFG + "probe: at 0.0,0.0 bed will contact at z=\n", "log.txt:", "contact at z='"),
         (RRF.replace("G30 P3", "G30 P2"), "log.txt:", "4 heights of 3 points"),
         (RRF.replace("heights: 0.0000", "heights: failed"), "log.txt:", "failed"),
     ],
@@ -317,21 +291,6 @@ def test_a_missing_log_is_named(tmp_path):
     assert "notes.txt is not recognised as a printer's log" in " ".join(done.stderr.split())
 
 
-def test_the_command_writes_a_session_and_its_robot(tmp_path):
-    log = tmp_path / "printer.cfg"
-    log.write_text(write_log("klipper", odd(), rings(), np.zeros(41), -1.0))
-    done = run_orthocal(tmp_path, "import", log, tmp_path / "bed")
-    assert done.returncode == 0, done.stderr
-    session = load_session(tmp_path / "bed")
-    direct = import_printer_log(log).session
-    assert session.firmware.radius == pytest.approx(direct.firmware.radius)
-    assert len(session.readings) == 41
-    assert run_orthocal(tmp_path, "calibrate", "--help").returncode == 0
-    again = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "klipper")
-    assert again.returncode == 2
-    assert "exists" in again.stderr
-
-
 @pytest.mark.parametrize("words", [[], ["--dry-run"]], ids=["written", "tried"])
 def test_the_command_prints_json(tmp_path, words):
     log = tmp_path / "printer.cfg"
@@ -344,23 +303,12 @@ def test_the_command_prints_json(tmp_path, words):
     written = None if words else str(tmp_path / "bed/session.yaml")
     assert document["written"] == written
     assert (tmp_path / "bed").exists() == (not words)
-
-
-def test_nothing_is_written_for_a_wrong_log(tmp_path):
-    log = tmp_path / "log.txt"
-    log.write_text(RRF.replace("G30 P3", "G30 P2"))
-    done = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "reprapfirmware")
-    assert done.returncode == 2
-    assert not (tmp_path / "bed").exists()
-
-
-def test_settings_may_come_from_another_file(tmp_path):
-    (tmp_path / "printer.cfg").write_text(write_settings("klipper", odd()))
-    log = tmp_path / "console.txt"
-    log.write_text("".join(f"probe at {x:.3f},{y:.3f} is z=0.1\n" for x, y in rings()))
-    result = import_printer_log(log, settings=[tmp_path / "printer.cfg"])
-    write_printer_import(result, tmp_path / "bed")
-    assert load_session(tmp_path / "bed").firmware.rods == pytest.approx((0.28, 0.2804, 0.2797))
+    if not words:
+        session = load_session(tmp_path / "bed")
+        assert len(session.readings) == 41
+        assert session.firmware.radius == pytest.approx(direct.session.firmware.radius)
+        again = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "klipper")
+        assert (again.returncode, "exists" in again.stderr) == (2, True)
 
 
 def test_heights_of_a_file_with_settings_are_not_those_of_a_log(tmp_path):
@@ -404,7 +352,7 @@ def test_a_copy_of_one_of_several_calibrated_logs_is_refused(tmp_path):
         (tmp_path / "log.txt").write_text(write_log("klipper", odd(), rings(), z, -1.0))
         write_printer_import(import_printer_log(tmp_path / "log.txt"), tmp_path / name)
     old, second, third = (load_session(tmp_path / n) for n in ("old", "second", "third"))
-    calibration = calibrate(join_sessions([old, second]))
+    calibration = identified([old, second])
     require_not_calibrated([third], calibration)
     for copied in (old, second):
         copy = replace(copied, sha256="")

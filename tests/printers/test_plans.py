@@ -29,23 +29,23 @@ CALIBRATED = Firmware(
 """Settings that a calibration chose: unlike every nominal machine."""
 
 
-@pytest.fixture(scope="module")
-def printer(tmp_path_factory):
+@pytest.fixture
+def printer(tmp_path):
     """Session of a printer's log, and a plan with a ball bar from it."""
-    folder = tmp_path_factory.mktemp("printer")
-    (folder / "log.txt").write_text(write_log("klipper", CALIBRATED, rings(), np.zeros(41)))
-    write_printer_import(import_printer_log(folder / "log.txt"), folder / "log")
-    (folder / "bar.yaml").write_text(BAR)
-    log = load_session(folder / "log")
-    equipment = Equipment(owned=(load_owned_sensor(folder / "bar.yaml"),), **FEW)
+    (tmp_path / "log.txt").write_text(write_log("klipper", CALIBRATED, rings(), np.zeros(41)))
+    write_printer_import(import_printer_log(tmp_path / "log.txt"), tmp_path / "log")
+    (tmp_path / "bar.yaml").write_text(BAR)
+    log = load_session(tmp_path / "log")
+    equipment = Equipment(owned=(load_owned_sensor(tmp_path / "bar.yaml"),), **FEW)
     with few_balls(2), uncompared(), few_machines():
         plan = plan_readings(
-            log.robot, "offsets", hours=0.5, equipment=equipment, measured=log, starts=1
+            log.robot, "offsets", hours=0.2, equipment=equipment, measured=log, starts=1
         )
     return log, plan.session
 
 
-def test_a_plan_from_a_log_states_its_controller(printer, tmp_path):
+def test_a_plan_from_a_log_states_its_controller_and_coordinates(printer, tmp_path):
+    """The name of a posture is where the firmware is sent. The drives are those it moves to."""
     log, plan = printer
     write_session(replace(plan, robot_reference=str(log.robot.folder)), tmp_path / "bar")
     written = load_plan(tmp_path / "bar")
@@ -55,11 +55,6 @@ def test_a_plan_from_a_log_states_its_controller(printer, tmp_path):
     with pytest.raises(SessionError, match=r"copy the block controller of .*log") as e:
         join_sessions([log, replace(written, firmware=None)])
     assert str(e.value.where).endswith("bar/session.yaml: controller.firmware")
-
-
-def test_lines_to_send_have_the_coordinates_of_the_firmware(printer):
-    """The name of a posture is where the firmware is sent. The drives are those it moves to."""
-    log, plan = printer
     with marked_pictures():
         files = sheet_files(plan)
     lines = "".join(t for n, t in files.items() if n.endswith(".txt"))

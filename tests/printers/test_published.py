@@ -92,14 +92,17 @@ def test_what_seven_points_determine():
     assert complete.assessment.of_kind("no redundancy")
 
 
-def made(folder, settings, firmware, errors, seed):
+def made(folder, settings, errors, seed, *, firmware="klipper", trigger=0.0, xy=None):
     """Log of a printer with given errors, and the printer."""
-    log = folder / "log.txt"
-    log.write_text(write_log(firmware, settings, rings(), np.zeros(41)))
-    printer = Printer(import_printer_log(log).session.robot, errors)
+    log, xy = folder / "log.txt", rings() if xy is None else xy
+    log.write_text(write_log(firmware, settings, xy, np.zeros(41), -trigger))
+    printer = Printer(import_printer_log(log).session.robot, errors, trigger=trigger)
     rng = np.random.default_rng(seed)
-    z = printer.probe(settings, rings(), noise=0.02, rng=rng)
-    log.write_text(write_log(firmware, settings, rings(), z))
+    if firmware == "marlin":
+        present = settings.endstops + np.sqrt(settings.rods**2 - settings.radius**2)
+        settings.endstops += 560.0 - present
+    z = printer.probe(settings, xy, noise=0.02, rng=rng)
+    log.write_text(write_log(firmware, settings, xy, z, -trigger))
     return printer, log, z
 
 
@@ -115,7 +118,7 @@ def test_rods_do_not_drift_where_a_search_without_priors_lets_them(tmp_path):
     for k, extra in lengths.items():
         errors |= {f"{k}_coupler.x": extra, f"frame.{k}_rod_b_tip.x": extra}
     settings = nominal(radius=135.0, rod=269.0)
-    _, log, z = made(tmp_path, settings, "klipper", errors, 3)
+    _, log, z = made(tmp_path, settings, errors, 3)
     travel = settings.travel(np.column_stack([rings(), z]))
     theirs, _ = calibrate_as_klipper(settings, travel, 0.0, extended=True, most=300)
     heights = locate(theirs, travel)[:, 2]
@@ -135,16 +138,12 @@ def test_trims_that_absorb_other_errors_are_undone(tmp_path):
     present = nominal(radius=91.5, rod=180.0)
     present.rods = 180.19 + np.array([6.348, -2.297, -3.480])
     errors = {"a_slide.x": -0.4e-3, "b_slide.offset": 0.7e-3, "c_slide.z": 0.3e-3}
-    log = tmp_path / "log.txt"
     xy = 0.6 * rings()
-    log.write_text(write_log("marlin", present, xy, np.zeros(41)))
-    robot = import_printer_log(log).session.robot
-    printer = Printer(robot, errors)
-    present.endstops += 560.0 - (present.endstops + np.sqrt(present.rods**2 - 91.5**2))
-    z = printer.probe(present, xy, noise=0.02, rng=np.random.default_rng(5))
-    log.write_text(write_log("marlin", present, xy, z))
+    printer, log, _ = made(tmp_path, present, errors, 5, firmware="marlin", xy=xy)
     imported = import_printer_log(log)
-    assert any("absorb" in note for note in imported.log.notes)
+    assert any("absorb" in note and "+6.158" in note for note in imported.log.notes)
+    lengths = [leg.length for leg in imported.session.robot.legs.values()]
+    assert lengths == pytest.approx([0.18038] * 3, abs=1e-5)
     result = identified(imported.session)
     lines = FIRMWARES["marlin"].config_lines(fit_firmware(result, "marlin").settings)
     new = read_settings("marlin", lines)
@@ -155,15 +154,9 @@ def test_trims_that_absorb_other_errors_are_undone(tmp_path):
 
 def test_one_mistyped_height_is_named(tmp_path):
     """A height of 1.58 in place of 1.85 among 41, as a saved value or one typed by hand."""
-    errors = {"a_slide.offset": 0.8e-3, "radius": 0.0, "b_slide.x": 0.3e-3}
-    errors.pop("radius")
-    settings = nominal()
-    log = tmp_path / "log.txt"
-    log.write_text(write_log("klipper", settings, rings(), np.zeros(41), -1.85))
-    printer = Printer(import_printer_log(log).session.robot, errors, trigger=1.85)
-    z = printer.probe(settings, rings(), noise=0.02, rng=np.random.default_rng(8))
-    text = write_log("klipper", settings, rings(), z, -1.85)
-    log.write_text(text)
+    errors = {"a_slide.offset": 0.8e-3, "b_slide.x": 0.3e-3}
+    _, log, _ = made(tmp_path, nominal(), errors, 8, trigger=1.85)
+    text = log.read_text()
     assert check_session(import_printer_log(log).session).decision.verdict == "enter"
     log.write_text(text.replace("height17 = 1.85", "height17 = 1.58"))
     judged = check_session(import_printer_log(log).session)
@@ -177,10 +170,7 @@ def test_one_mistyped_height_is_named(tmp_path):
 
 def test_a_log_with_the_settings_of_another_printer_is_rejected(tmp_path):
     """Nothing is said of offsets: the firmware takes settings."""
-    log = tmp_path / "log.txt"
-    log.write_text(write_log("klipper", nominal(), rings(), np.zeros(41), -1.0))
-    printer = Printer(import_printer_log(log).session.robot, {}, trigger=1.0)
-    z = printer.probe(nominal(), rings(), noise=0.02, rng=np.random.default_rng(1))
+    _, log, z = made(tmp_path, nominal(), {}, 1, trigger=1.0)
     z += 2.5 * (np.hypot(*rings().T) / 80.0) ** 2  # as with a radius that differs by 12 mm
     log.write_text(write_log("klipper", nominal(), rings(), z, -1.0))
     decision = calibrate(import_printer_log(log).session, solver="linearised").assessment.decision

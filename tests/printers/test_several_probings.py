@@ -96,6 +96,7 @@ TABLE = (
     ".    c:+0.0{i}   x:+0.20   y:-0.10   z:+0.30\n.      yz:+0.40  zx:-0.50  xy:+0.60\n"
     ".Height:310.00  Ex:+0.00  Ey:+0.00  Ez:+0.00  Radius:145.00\n.    c:+9.00 x:+9 y:+9 z:+9\n"
 )
+POINTS = "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.1\nBed X: 0 Y: 50 Z: 0.1\n"
 M503 = "M665 L280.00 R140.00 H310.000 S200 B80.00 X0.00 Y0.00 Z0.00\nM666 X0 Y0 Z0\nM851 Z0\n"
 
 
@@ -116,16 +117,14 @@ def test_the_last_complete_g33_is_used(read):
 
 def test_g33_before_other_points_changed_the_settings(read):
     """The settings of G29 are those that M503 or G33 printed last before it."""
-    points = "".join(f"Bed X: {x} Y: {y} Z: 0.1\n" for x, y in ((0, 0), (50, 0), (0, 50)))
     g33 = G33.format(h=309.0, r=141.5, table=TABLE.format(i=1).replace("145.00", "141.52"))
-    assert read(M503 + g33 + points).settings.radius == pytest.approx(141.52 * MM)
+    assert read(M503 + g33 + POINTS).settings.radius == pytest.approx(141.52 * MM)
     exact = M503.replace("R140.00", "R141.518")
-    assert read(M503 + g33 + exact + points).settings.radius == pytest.approx(141.518 * MM)
+    assert read(M503 + g33 + exact + POINTS).settings.radius == pytest.approx(141.518 * MM)
 
 
 def test_b_is_a_radius_in_marlin_1(read):
-    text = M503 + "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.1\nBed X: 0 Y: 50 Z: 0.1\n"
-    log = read(text)
+    log = read(M503 + POINTS)
     assert log.settings.firmware == "marlin1"
     assert log.settings.rods == pytest.approx([0.28] * 3)
     assert "B80" in log.notes[0]
@@ -144,17 +143,15 @@ def test_b_is_a_radius_in_marlin_1(read):
 )
 def test_b_is_a_trim_in_later_versions(read, letters, firmware, rods):
     """What M503 prints without A, B and C has no trims."""
-    points = "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.1\nBed X: 0 Y: 50 Z: 0.1\n"
-    settings = read(M503.replace("B80.00", letters) + points).settings
+    settings = read(M503.replace("B80.00", letters) + POINTS).settings
     assert settings.firmware == firmware
     assert np.array(settings.rods) / MM == pytest.approx(rods)
 
 
 def test_trims_that_marlin_1_lacks_are_refused(read):
-    points = "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.1\nBed X: 0 Y: 50 Z: 0.1\n"
     with pytest.raises(SessionError, match="--format marlin"):
-        read(M503.replace("B80.00", "A0 B0 C1") + points, firmware="marlin1")
-    assert read(M503.replace("S200 B80.00", "") + points, firmware="marlin1").settings.firmware == (
+        read(M503.replace("B80.00", "A0 B0 C1") + POINTS, firmware="marlin1")
+    assert read(M503.replace("S200 B80.00", "") + POINTS, firmware="marlin1").settings.firmware == (
         "marlin1"
     )
 

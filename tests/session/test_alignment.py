@@ -104,11 +104,7 @@ def with_other_gauge_first(session):
 
 @pytest.mark.parametrize(
     ("setups_of_second", "scale", "settings", "cycles"),
-    [
-        ({1, 3, 5}, 5.0, {}, False),
-        ({1}, 5.0, {}, True),
-        ({1, 3, 5}, 5.0, {"loss": "huber"}, False),
-    ],
+    [({1, 3, 5}, 5.0, {}, False), ({1}, 5.0, {}, True), ({1, 3, 5}, 5.0, {"loss": "huber"}, False)],
     ids=["more", "few readings", "robust"],
 )
 def test_the_order_of_gauges_changes_no_estimate(setups_of_second, scale, settings, cycles):

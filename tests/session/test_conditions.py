@@ -361,16 +361,6 @@ def test_an_import_changes_conditions_only_with_overwrite(tmp_path):
     assert not imported(folder, table.replace("21.0", "20.0")).changes
 
 
-def test_times_of_a_clock_are_omitted_by_default(tmp_path):
-    folder = write(tmp_path / "first", PLANNED)
-    table = IMPORTED.replace("2025-03-14 09:26", "9:26")
-    result = imported(folder, table)
-    assert "time" not in result.columns.single
-    assert len(result.columns.extra) == 2
-    with pytest.raises(SessionError, match="time is '9:26'"):
-        imported(folder, table, columns={"time": "Time"})
-
-
 # ---- records
 
 

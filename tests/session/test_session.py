@@ -11,16 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tolerances import CLOSED_FORM, KINEMATICS
 
-from orthocal import (
-    Gauge,
-    Section,
-    Tip,
-    calibrate,
-    load_plan,
-    load_session,
-    plan_readings,
-    write_session,
-)
+from orthocal import Gauge, Section, Tip, load_session, plan_readings, write_session
 from orthocal.effects.compensation import JointTrim
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import build_problem
@@ -92,23 +83,6 @@ def test_sections_become_planes_along_the_leg(tmp_path, section, expected):
     assert from_root is expected[1]
 
 
-def test_a_plan_lists_its_readings_setup_by_setup(root):
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
-    labels = [(r.setup, r.posture, r.cycle) for r in plan.readings]
-    assert labels[:4] == [
-        ("yx", "zero", 1),
-        ("yx", "x_max", 1),
-        ("yx", "x_min", 1),
-        ("yx", "zero", 2),
-    ]
-    assert len(labels) == 6 * 3 * 3
-
-
-def test_a_session_is_also_a_plan(root, raw_cycles):
-    plan = load_plan(root / "examples/raw-cycles")
-    assert [r.label for r in plan.readings] == [r.label for r in raw_cycles.readings]
-
-
 @pytest.mark.parametrize("example", ["table1/experiment-2", "raw-cycles"])
 def test_a_loaded_session_is_the_written_one(tmp_path, example):
     session = session_of(example)
@@ -171,23 +145,6 @@ def test_any_session_is_the_same_after_a_round_trip(
     assert np.abs(again.active_offsets - session.active_offsets).max() < 1e-14
 
 
-def test_semicolons_and_a_byte_order_mark_are_read(tmp_path):
-    rows = "\ufeffsetup;posture;reading_mm\nyx;zero;0.1\n\nyx;x_max;0.2\n"
-    session = load_session(write(tmp_path / "s", rows=rows))
-    assert np.allclose(session.values, [0.1e-3, 0.2e-3])
-
-
-def test_the_path_may_be_the_file_or_the_directory(root):
-    a = load_session(root / "examples/raw-cycles/session.yaml")
-    b = load_session(str(root / "examples/raw-cycles"))
-    assert a.sha256 == b.sha256
-
-
-def test_a_robot_beside_the_session_is_found(root, tmp_path):
-    head = HEAD.replace("orthoglide", str(root / "robots/orthoglide"))
-    assert load_session(write(tmp_path / "s", head=head)).robot.name == "orthoglide"
-
-
 def test_a_robot_without_legs_cannot_be_measured(root, tmp_path):
     head = HEAD.replace("orthoglide", str(root / "tests/robots/fivebar"))
     with pytest.raises(SessionError, match="'fivebar' has no legs for a gauge to touch"):
@@ -212,13 +169,6 @@ def test_a_session_written_elsewhere_has_its_robot(root, tmp_path):
 )
 def test_names_of_joined_sessions_have_a_label(name, joined, parts):
     assert split_label(name, joined=joined) == parts
-
-
-def test_a_plan_is_not_calibrated(root):
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
-    assert np.isnan(plan.values).all()
-    with pytest.raises(SessionError, match="54 of 54 readings have no value"):
-        calibrate(plan, "offsets")
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,7 @@ from watchdog import cpu_limit
 from orthocal.errors import SessionError
 from orthocal.io.tables import workbook
 from orthocal.io.tables.cell import MOST_COLUMNS, MOST_ROWS
-from orthocal.io.tables.workbook import (
-    LARGEST_CONTENT,
-    LARGEST_PART,
-    MOST_PARTS,
-    read_workbook,
-)
+from orthocal.io.tables.workbook import LARGEST_CONTENT, LARGEST_PART, MOST_PARTS, read_workbook
 
 SHEET = "xl/worksheets/sheet1.xml"
 STYLES = "xl/styles.xml"
@@ -172,44 +167,38 @@ def test_entities_are_not_resolved(encoding):
     )
 
 
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (
-            f'<row r="{10**9}"><c r="A{10**9}"><v>1</v></c></row>',
-            f"sheet 'Sheet': has more than {MOST_ROWS} rows",
-        ),
-        (
-            '<row r="1"><c r="XFD1"><v>1</v></c></row>',
-            f"sheet 'Sheet': has 16384 columns; expected at most {MOST_COLUMNS}",
-        ),
-        (
-            f"<row>{'<c><v>1</v></c>' * 500}</row>" * (CELLS // 500 + 1),
-            f"sheet 'Sheet': has more than {CELLS} cells",
-        ),
-        (
-            "<x/>" * (TAGS + 1),
-            f"has more than {TAGS} XML tags in {SHEET}",
-        ),
-        (
-            '<row r="2"/><row r="1"/>',
-            "is not a readable .xlsx workbook: row 1 follows row 2",
-        ),
-        (
-            '<row r="1"><c r="B1"/><c r="A1"/></row>',
-            "is not a readable .xlsx workbook: cell A1 is out of order",
-        ),
-        (
-            '<row r="1"><c r="A1" t="x"><v>1</v></c></row>',
-            "is not a readable .xlsx workbook: 'x' is not the type of a cell",
-        ),
-        (
-            '<row r="1"><c r="A1" t="s"><v>-1</v></c></row>',
-            "is not a readable .xlsx workbook: '-1' is not an index",
-        ),
-    ],
-    ids=["far-row", "far-column", "cells", "tags", "row-order", "cell-order", "type", "index"],
-)
+UNREADABLE = "is not a readable .xlsx workbook: "
+REFUSED = {
+    "far-row": (
+        f'<row r="{10**9}"><c r="A{10**9}"><v>1</v></c></row>',
+        f"sheet 'Sheet': has more than {MOST_ROWS} rows",
+    ),
+    "far-column": (
+        '<row r="1"><c r="XFD1"><v>1</v></c></row>',
+        f"sheet 'Sheet': has 16384 columns; expected at most {MOST_COLUMNS}",
+    ),
+    "cells": (
+        f"<row>{'<c><v>1</v></c>' * 500}</row>" * (CELLS // 500 + 1),
+        f"sheet 'Sheet': has more than {CELLS} cells",
+    ),
+    "tags": ("<x/>" * (TAGS + 1), f"has more than {TAGS} XML tags in {SHEET}"),
+    "row-order": ('<row r="2"/><row r="1"/>', UNREADABLE + "row 1 follows row 2"),
+    "cell-order": (
+        '<row r="1"><c r="B1"/><c r="A1"/></row>',
+        UNREADABLE + "cell A1 is out of order",
+    ),
+    "type": (
+        '<row r="1"><c r="A1" t="x"><v>1</v></c></row>',
+        UNREADABLE + "'x' is not the type of a cell",
+    ),
+    "index": (
+        '<row r="1"><c r="A1" t="s"><v>-1</v></c></row>',
+        UNREADABLE + "'-1' is not an index",
+    ),
+}
+
+
+@pytest.mark.parametrize(("rows", "message"), REFUSED.values(), ids=REFUSED)
 def test_sheets_that_are_refused(rows, message, monkeypatch):
     monkeypatch.setattr(workbook, "MOST_CELLS", CELLS)
     monkeypatch.setattr(workbook, "MOST_TAGS", TAGS)
@@ -228,10 +217,7 @@ def test_sheets_that_are_refused(rows, message, monkeypatch):
         ({SHEET: b"<worksheet>"}, "is not a readable .xlsx workbook: Premature end of data"),
         ({SHEET: None}, f"is damaged: {SHEET} is missing"),
         ({"xl/workbook.xml": b"<a/>"}, "is a workbook without worksheets"),
-        (
-            {f"a{i}": b"" for i in range(2001)},
-            f"has 2010 parts; expected at most {MOST_PARTS}",
-        ),
+        ({f"a{i}": b"" for i in range(2001)}, f"has 2010 parts; expected at most {MOST_PARTS}"),
     ],
     ids=["ods", "xlsb", "zip", "cut-off", "no-sheet", "no-sheets", "many-parts"],
 )
