@@ -77,8 +77,8 @@ def first_layer(printer, settings):
 
 
 def tool_error(printer, settings):
-    """RMS deviation of a printed box, placed on the bed as it comes, [mm]."""
-    line = np.linspace(-1.0, 1.0, 7)
+    """RMS deviation over the volume of a printed box, placed on the bed as it comes, [mm]."""
+    line = np.arange(-6, 7, 2) / 7.0  # middles of seven equal parts
     x, y, z = (v.ravel() for v in np.meshgrid(line, line, line))
     wanted = np.column_stack([x * HALF_MM, y * HALF_MM, (z + 1.0) * HALF_MM])
     reached = printer.nozzle(settings.travel(wanted)) @ bed_axes(printer)

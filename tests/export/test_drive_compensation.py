@@ -710,3 +710,35 @@ def test_motions_are_divided_where_a_drive_reverses():
     ]
     assert parts.reversed.all()
     assert sides.last.tolist() == [-1.0, 1.0, 1.0]
+
+
+def test_latch_direction_is_positive_by_default(calibration):
+    """The lines then also state HOME_OFFSET of the other direction."""
+
+    def export(**options):
+        options = ExportOptions(home_offsets=(0.3, 0.3, 0.3), **options)
+        return export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+
+    signs = "# signs of HOME_LATCH_VEL: [+, +, +]\n"  # stated for the next commands
+    for module, file in ((True, "kinematics.ini"), (False, "joints.ini")):
+        default, stated = (export(module=module, latched=s) for s in (None, (1, 1, 1)))
+        assert (signs in default[file], signs in stated[file]) == (False, True)
+        for name in {"joints.ini", "orthocal_core.c"} & default.keys():
+            bare = "".join(
+                line
+                for line in default[name].splitlines(keepends=True)
+                if not line.startswith("# if HOME_LATCH_VEL")
+            )
+            assert bare == stated[name].replace(signs, "")
+        page = " ".join(default["README.md"].split())
+        assert "assumed" in page
+        assert "assumed" not in stated["README.md"]
+        # a module displaces the joints, and HOME_OFFSET remains
+        displaced = "The module contains half" if module else "is subtracted from HOME_OFFSET"
+        assert re.findall("The module contains half|is .* from HOME_OFFSET", page) == [displaced]
+    lines = default["joints.ini"]
+    other = [float(v) for v in re.findall(r"negative: HOME_OFFSET = (\S+)", lines)]
+    opposite = home_offsets(export(module=False, latched=(-1, -1, -1))["joints.ini"])
+    assert other == opposite
+    backlash = [TRUTH[f"{d.name}.backlash"] / MM for d in calibration.robot.drives]
+    assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3

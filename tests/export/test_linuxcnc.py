@@ -16,7 +16,14 @@ import numpy as np
 import pytest
 from calibrated import UNJUDGED
 from commands import run_orthocal
-from linuxcnc import Joint, enter_lines, few_nodes, filter_program, run_program
+from linuxcnc import (
+    Joint,
+    enter_lines,
+    few_nodes,
+    filter_program,
+    require_linuxcnc,
+    run_program,
+)
 from programs import distances, rigid_motion
 from test_correction_field import tips
 
@@ -77,6 +84,11 @@ def mixed(root, tmp_path_factory):
         text = text.replace(entry, f"{entry}, joint: {joint}")
     file.write_text(text)
     return folder
+
+
+ENTERED = 0.2e-6
+"""Tolerance of HOME_OFFSET, [m]: three drives home to 0.02 µm; their offsets are multiples of 1 µm,
+to which they are entered."""
 
 
 def calibrated(root, folder, example, truth, model, *, active=ACTIVE):
@@ -564,3 +576,50 @@ def test_linuxcnc_window_shows_the_message_of_a_refused_program(filtered):
     # file names without a filter in the INI
     assert filtered(["G0 X0 Y0 Z0"], name="part.nc")[0] is None
     assert filtered(["G0 X0 Y0 Z0"], name="PART.NGC")[0] is None
+
+
+@pytest.mark.acceptance
+def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
+    """The calibrated machine follows a circle off centre and lines in space."""
+    require_linuxcnc()
+    options = ExportOptions(within=WITHIN)
+    with few_nodes(degree=6):
+        files = export_calibration(full, "linuxcnc", anyway=True, options=options)
+    write_files(tmp_path, files)
+    centre, radius = (12.0, -8.0, 15.0), 16.0
+    corners = [(28.0, -8.0, 15.0), (-35.0, 20.0, -25.0), (-35.0, -30.0, 10.0)]
+    program = [
+        "G21 G90 G61 G1 X28 Y-8 Z15 F6000",
+        "G21 G90 G61 F6000 G2 X28 Y-8 Z15 I-16 J0",
+        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in corners[1:]),
+    ]
+    old = joints_at_switch(full, SWITCH)
+    slides = run_program(
+        program, joints_of(full, old), lines=files["kinematics.ini"], module=tmp_path
+    )
+
+    path = centre, radius, corners
+    tool = full.machine.forward(slides[::5] * MM) / MM
+    require_followed(from_pieces(tool, *path), PATH, [150, 100, 80])
+    # the errors of the machine are large
+    nominal = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
+    assert from_pieces(nominal, *path).min(axis=0).max() > 1.0 * MM
+
+
+@pytest.mark.acceptance
+def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
+    """One joint counts up, two count down."""
+    require_linuxcnc()
+    old = joints_at_switch(offsets, SWITCH)
+    machine = Machine(offsets.robot, OFFSETS)
+    point = np.array([20.0, -15.0, 30.0]) * MM
+    options = ExportOptions(home_offsets=tuple(old))
+    entered = export_calibration(offsets, "linuxcnc", options=options)["joints.ini"]
+    drives = Machine(offsets.robot, {}).inverse(point)  # nominal kinematics
+    joints = [float(d.to_joint(r)) / MM for d, r in zip(offsets.robot.drives, drives, strict=True)]
+    words = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", joints, strict=True))
+    program = [f"G21 G90 G1 {words} F6000", "G4 P0.15"]
+    slides = run_program(program, joints_of(offsets, old), lines=entered)
+    assert np.linalg.norm(machine.forward(slides[-1] * MM) - point) < ENTERED
+    # with the previous offsets the error is large
+    assert np.linalg.norm(machine.forward(drives - ACTIVE) - point) > 0.5 * MM

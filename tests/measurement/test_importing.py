@@ -116,16 +116,31 @@ def one(value, *, unit="mm"):
 FORMS = [
     text("house", ENGLISH),
     text("german-excel", GERMAN),
+    text("german-cp1252-en-dash", GERMAN.replace("-0", "–0"), encoding="cp1252"),
+    text("minus-sign", GERMAN.replace("-0", "−0")),
     text("minus-hyphens", GERMAN.replace("-0", "‐0")),
+    text("minus-and-blank", GERMAN.replace("-0", "− 0")),
+    text("plus-sign", GERMAN.replace("1,5", "+1,5")),
+    text("byte-order-mark", GERMAN, encoding="utf-8-sig"),
+    text("utf16-with-mark", GERMAN.replace(";", "\t"), encoding="utf-16"),
+    text("utf16-le", GERMAN, encoding="utf-16-le"),
+    text("utf16-be", GERMAN.replace("-0", "−0"), encoding="utf-16-be"),
     Form("utf16-cut", GERMAN.encode("utf-16-le")[:-1],
          f"{{}}: is not utf-16-le text (byte {2 * len(GERMAN) - 2})"),
+    text("tabs", ENGLISH.replace(",", "\t")),
+    text("tabs-and-decimal-commas", GERMAN.replace(";", "\t")),
+    text("pipes", ENGLISH.replace(",", "|")),
     text("commas-and-quoted-decimal-commas", ENGLISH.replace("0.00", '"0,00"')
          .replace("-0.43", '"-0,43"').replace("1.5", '"1,5"')),
+    text("all-quoted", '"Setup";"Posture";"Reading_mm"\n"xy";"zero";"0,00"\n"xy";"x_max";"-0,43"\n'
+         '"yx";"zero";"1,5"\n'),
     text("lines-of-a-mac", GERMAN.replace("\r\n", "\r")),
     text("stated-separator", f"sep=;\n{GERMAN}"),
     text("capitals", ENGLISH.replace("setup,posture,reading_mm", " SETUP , Posture ,READING_MM")
          .replace("xy,", "XY,").replace("x_max", "X max")),
+    text("bracketed-unit", GERMAN.replace("Messwert [mm]", "Ablesung (mm)")),
     text("line-break-in-heading", GERMAN.replace("Messwert [mm]", '"Messwert\n[mm]"')),
+    text("unit-after-in", GERMAN.replace("Messwert [mm]", "Wert in mm")),
     text("unit-in-a-row-of-its-own", "Setup;Posture;Value\n;;mm\nxy;zero;0,00\nxy;x_max;-0,43\n"
          "yx;zero;1,5\n"),
     text("unit-in-cells", "Setup;Posture;Value\nxy;zero;0,00 mm\nxy;x_max;-430 µm\n"
@@ -144,11 +159,24 @@ FORMS = [
     text("fill", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\nyx;zero;1,5\n", fill=True),
     text("fill-below-setups", "setup;posture;Wert mm\nxy;;\n;zero;0,00\n;x_max;-0,43\nyx;;\n"
          ";zero;1,5\n", fill=True),
+    text("fill-below-postures", "posture;setup;Wert mm\nzero;;\n;xy;0,00\nx_max;;\n;xy;-0,43\n"
+         "zero;;\n;yx;1,5\n", fill=True),
     text("not-filled", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\n",
          "{}:3: has a reading but no setup; --fill copies the setup from the row above"),
     text("total", "setup;posture;Wert mm\nxy;zero;0,00\n;Summe:;-0,43\n",
          "{}:3: has a reading but no setup; it seems to be a total of others: delete it"),
+    text("groups-by-point", HEAD.replace("mm", "um") + "xy;zero;1.234,5\n",
+         one("1234.5", unit="um")),
+    text("groups-by-comma", HEAD.replace("mm", "um") + "xy;zero;1,234.5\n",
+         one("1234.5", unit="um")),
+    text("groups-by-blank", HEAD.replace("mm", "um") + "xy;zero;1\u202f234,5\n",
+         one("1234.5", unit="um")),
+    text("groups-by-apostrophe", HEAD.replace("mm", "µm") + "xy;zero;1’234.5\n",
+         one("1234.5", unit="um")),
     text("micrometres", "setup;posture;Wert in µm\nxy;zero;-12,5\n", one("-12.5", unit="um")),
+    text("micrometres-cp1252", "setup;posture;Wert [µm]\nxy;zero;-12,5\n", one("-12.5", unit="um"),
+         encoding="cp1252"),
+    text("inches", 'setup;posture;reading (in)\nxy;zero;-.0125\n', one("-.0125", unit="inch")),
     text("inch-marks", 'setup|posture|reading\nxy|zero|0.005"\n', one("0.005", unit="inch")),
     text("unit-from-option", UNITLESS, one("0.5"), unit="mm"),
     text("inch-from-option", UNITLESS, one("0.5", unit="inch"), unit="inch"),
@@ -158,11 +186,14 @@ FORMS = [
          "{}:2: the reading is in mm, which contradicts --unit um", unit="um"),
     text("other-unit-in-a-cell", HEAD + "xy;zero;0,5 µm\n",
          "{}:2: the reading is in um, and its heading says mm"),
+    text("exponents", HEAD + "xy;zero;-1,25E-02\n", one("-0.0125")),
     text("many-digits", HEAD + "xy;zero;0,12345678901234567890123\n",
          one("0.12345678901234567890123")),
     text("wide-cycles", "setup,posture,cycle 1,cycle 2\nxy,zero,0.01,-0.02\nxy,x_max,0.5,0.52\n",
          WIDE, unit="mm"),
     text("wide-readings", "setup;posture;reading 1_mm;reading 2_mm\nxy;zero;0,01;-0,02\n"
+         "xy;x_max;0,5;0,52\n", WIDE),
+    text("wide-units-first", "setup;posture;reading_mm_1;reading_mm_2\nxy;zero;0,01;-0,02\n"
          "xy;x_max;0,5;0,52\n", WIDE),
     text("wide-german", "Aufstellung\tStellung\t1. Durchgang [mm]\t2. Durchgang [mm]\tMittelwert\n"
          "xy\tzero\t0,01\t-0,02\t-0,005\nxy\tx_max\t0,5\t0,52\t0,51\n", WIDE),
@@ -191,9 +222,12 @@ FORMS = [
     text("thousand-or-decimal-by-point", UNITLESS.replace("0,5", "-1.234"),
          "{}:2: the reading '-1.234' is -1234 with a decimal comma and -1.234 with a decimal "
          "point, " + WHICH, unit="um"),
+    text("sign-from-another-cell", HEAD + "xy;zero;1,234\nxy;x_max;0,5\n",
+         (("xy", "zero", "", 1, "1.234"), ("xy", "x_max", "", 1, "0.5"))),
     text("sign-from-an-option", HEAD + "xy;zero;1,234\n", one("1.234"), decimal="comma"),
     text("thousand-by-an-option", HEAD.replace("mm", "um") + "xy;zero;1,234\n",
          one("1234", unit="um"), decimal="point"),
+    text("leading-zero", HEAD + "xy;zero;0,123\n", one("0.123")),
     text("both-signs", HEAD + "xy;zero;0,5\nxy;x_max;0.5\n",
          "{}:3: the reading '0.5' has a decimal point, and '0,5' in line 2 a decimal comma; use "
          "one decimal sign"),
@@ -229,7 +263,14 @@ FORMS = [
     text("decimal-comma-between-commas", "setup,posture,reading_mm\nxy,zero,0,5\n",
          "{}:2: has 4 fields; expected 3; a decimal comma between commas? Save the table with "
          "semicolons, or its numbers in quotes"),
+    text("temperature-between-commas", "setup,posture,T,reading_mm\nxy,zero,21,5,\n",
+         "{}:2: has 5 fields; expected 4; a decimal comma between commas? Save the table with "
+         "semicolons, or its numbers in quotes"),
     text("no-number", HEAD + "xy;zero;gut\n", "{}:2: the reading is 'gut'; expected a number"),
+    text("error-of-a-spreadsheet", HEAD + "xy;zero;#DIV/0!\n",
+         "{}:2: the reading is '#DIV/0!'; expected a number"),
+    text("wrong-digits", HEAD + "xy;zero;٣\n", "{}:2: the reading is '٣'; expected a number"),
+    text("minus-behind", HEAD + "xy;zero;0,5-\n", "{}:2: the reading is '0,5-'; expected a number"),
     text("unknown-setup", HEAD + "xz;zero;0,5\n", "{}:2: 'xz' is not a setup; setups: xy, yx"),
     text("unknown-posture", HEAD + "xy;null;0,5\n",
          "{}:2: 'null' is not a posture; postures: zero, x_max, x_-40"),
@@ -256,6 +297,8 @@ FORMS = [
          "{}: is an old .xls, or protected by a password; save it as .xlsx or CSV"),
     book("workbook", CELLS),
     book("workbook-with-a-title", [["Protokoll"], [], *CELLS]),
+    book("workbook-of-texts", [CELLS[0], ["xy", "zero", "0,00"], ["xy", "x_max", "−0,43"],
+                               ["yx", "zero", "1,5"]]),
     book("workbook-of-both", [CELLS[0], ["xy", "zero", "0,00"], *CELLS[2:]]),
     book("workbook-merged", [*CELLS[:2], [None, "x_max", -0.43], CELLS[3]], edit=merge),
     book("workbook-not-merged", [*CELLS[:2], [None, "x_max", -0.43]],

@@ -417,3 +417,20 @@ def test_sections_with_hyphens_are_sections(probed):
 def test_numbers_of_a_calculation_are_finite(probed, name, value):
     with pytest.raises(SessionError, match=r"is damaged|expected"):
         probed(calculation(**{name: value}))
+
+
+def test_nothing_is_written_for_a_wrong_log(tmp_path):
+    log = tmp_path / "log.txt"
+    log.write_text(RRF.replace("G30 P3", "G30 P2"))
+    done = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "reprapfirmware")
+    assert done.returncode == 2
+    assert not (tmp_path / "bed").exists()
+
+
+def test_settings_may_come_from_another_file(tmp_path):
+    (tmp_path / "printer.cfg").write_text(write_settings("klipper", odd()))
+    log = tmp_path / "console.txt"
+    log.write_text("".join(f"probe at {x:.3f},{y:.3f} is z=0.1\n" for x, y in rings()))
+    result = import_printer_log(log, settings=[tmp_path / "printer.cfg"])
+    write_printer_import(result, tmp_path / "bed")
+    assert load_session(tmp_path / "bed").firmware.rods == pytest.approx((0.28, 0.2804, 0.2797))
