@@ -10,9 +10,9 @@ import pinocchio as pin
 import pytest
 from adjusting import TOLERANCES, shim, shimmed_plan, turned
 from commands import run_orthocal
-from derivatives import assert_derivative
+from derivatives import assert_derivative, assert_jacobian
 from machines import frames, reading_by_pinocchio
-from tolerances import CLOSED, DERIVATIVE, KINEMATICS
+from tolerances import CLOSED, KINEMATICS
 
 from orthocal import (
     Choice,
@@ -253,17 +253,11 @@ def test_the_jacobian_under_adjustments_is_exact(plan):
     """Also with respect to the errors of the setting, at random errors."""
     problem = build_problem(join_sessions(sessions_of(plan)), model="full", prior=True)
     rng = np.random.default_rng(2)
-    scale = problem.theta_scale
-    theta = 0.1 * scale * rng.normal(size=problem.n_free)
+    theta = 0.1 * problem.theta_scale * rng.normal(size=problem.n_free)
     _, jacobian = problem.predict_and_jacobian(theta)
     chosen = [problem.free.index(n) for n in problem.free if n.endswith(".setting")]
     chosen += list(rng.choice(problem.n_machine, 12, replace=False))
-    for j in chosen:
-        at = np.zeros_like(theta)
-        at[j] = 1e-2 * scale[j]
-        numeric = (problem.predict(theta + at) - problem.predict(theta - at)) / 2e-2
-        size = max(np.abs(numeric).max(), 1e-9)
-        assert np.abs(jacobian[:, j] - numeric).max() / size < 100 * DERIVATIVE, problem.free[j]
+    assert_jacobian(problem, theta, jacobian, columns=chosen, step=1e-2, tolerance=1e-5)
     moved = problem.free.index("x_outer_foot_z.setting")
     still = problem.free.index("x_inner_foot_z.setting")
     assert np.abs(jacobian[:, moved]).max() > 1e-8

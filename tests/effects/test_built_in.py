@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from derivatives import assert_jacobian
 from effect_plans import ALL, effect_plan
-from tolerances import DERIVATIVE, SAME_OPTIMUM
+from tolerances import SAME_OPTIMUM
 
 from orthocal import simulate_session
 from orthocal.estimation.problem import build_problem
@@ -44,22 +45,13 @@ def point(problem, seed=2):
     return np.maximum(theta, problem.selection.lower)
 
 
-def require_derivatives(problem, theta, jacobian):
-    """Refuse a Jacobian other than central differences, each column by its size or by 10 nm."""
-    steps = 1e-2 * np.diag(problem.theta_scale)
-    ahead, behind = np.split(problem.predict(np.vstack([theta + steps, theta - steps])), 2)
-    numeric = (ahead - behind).T / 2e-2
-    size = np.maximum(np.abs(numeric).max(axis=0), 1e-8)
-    assert (np.abs(jacobian - numeric) / size).max() < 10 * DERIVATIVE
-
-
 def test_derivatives_are_those_of_the_readings(plan):
     """Two machines at once, under many conditions."""
     problem = build(plan)
     thetas = np.array([point(problem, seed) for seed in (3, 4)])
     _, jacobians = problem.predict_and_jacobian(thetas)
     for theta, jacobian in zip(thetas, jacobians, strict=True):
-        require_derivatives(problem, theta, jacobian)
+        assert_jacobian(problem, theta, jacobian, step=1e-2, least=1e-8)
     names = [*errors_of(plan), *(n for n in problem.free if n.endswith(".drift"))]
     at = [problem.free.index(n) for n in names]
     assert len(at) == 3 + 2 + 6 + 6

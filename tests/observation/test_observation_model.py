@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from derivatives import assert_jacobian
 from gauges import exact
 from tool_coordinate import ToolCoordinate
 
@@ -128,12 +129,7 @@ def test_simulation_and_problem_predict_the_same_readings(problem):
 def test_the_jacobian_is_that_of_central_differences(problem):
     theta, _, passive, _ = draw(problem, count=1)
     reading, jacobian = problem.predict_and_jacobian(theta, passive)
-    steps = 1e-3 * np.diag(problem.theta_scale)  # a thousandth of a tolerance
-    ahead, behind = np.split(problem.predict(np.vstack([theta + steps, theta - steps])), 2)
-    numeric = (ahead - behind).T / 2e-3
-    assert np.isfinite(jacobian).all()
-    largest = max(1e-3, np.abs(numeric).max())
-    assert np.abs(jacobian[0] - numeric).max() < 1e-6 * largest  # third order
+    assert_jacobian(problem, theta[0], jacobian[0], least=1e-3)
     si_reading, si = problem.predict_and_jacobian(theta, passive, units="SI")
     assert np.array_equal(si_reading, reading)
     assert np.allclose(si * problem.theta_scale, jacobian, rtol=1e-14, atol=0.0)
