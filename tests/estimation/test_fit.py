@@ -58,15 +58,6 @@ def test_a_parameter_at_its_bound_acts_like_a_known_value(session):
         assert bounded[name].std == pytest.approx(known[name].std, rel=1e-3)
 
 
-def test_bounds_that_do_not_bind_change_nothing(session):
-    free = identified(session)
-    bounded = identified(session, Choice(bounds={"*.offset_m": (-5e-3, 5e-3)}))
-    for a, b in zip(free.free, bounded.free, strict=True):
-        assert a.value == pytest.approx(b.value, abs=SAME_OPTIMUM)
-        assert a.std == pytest.approx(b.std, rel=1e-6)
-        assert b.at_bound is None
-
-
 def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):
     """y is best at −0.0948 mm while x and z are held: 5 µm from a bound that does not hold it."""
     narrow = identified(experiment_2, Choice(bounds={"*.offset_m": (-1e-4, 1e-4)}))
@@ -127,28 +118,16 @@ def test_readings_without_deviation_are_explained(exact_plan):
     still = calibrate(simulate_session(exact_plan, {}, exact=True).session, **UNJUDGED)
     (found,) = still.assessment.of_kind("no deviation")
     assert found.numbers["before_rms_mm"] == pytest.approx(0.0, abs=1e-9)
-    assert not calibrate(plan_with_truth(exact_plan), **UNJUDGED).assessment.of_kind("no deviation")
 
 
-def plan_with_truth(exact_plan):
-    return simulate_session(exact_plan, TRUTH, seed=0).session
-
-
-def test_parameters_without_sensitivity_are_explained(exact_plan):
+def test_parameters_without_sensitivity_are_explained(session):
     """The platform's own placement is seen by no reading of leg x alone."""
-    result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]), **UNJUDGED)
+    result = calibrate(session, Choice(free=["frame.tcp.*"]), **UNJUDGED)
     (found,) = result.assessment.of_kind("no sensitivity")
+    assert not result.assessment.of_kind("no deviation")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
     assert "effects of all free parameters on the readings are below the noise" in found.text
     assert set(result.identifiability.below_noise) == {p.name for p in result.free}
-
-
-def test_iterations_and_times_are_recorded(session):
-    result = identified(session, solver="ipopt")
-    assert result.solver.status == "Solve_Succeeded"
-    assert result.solver.iterations >= 1
-    assert result.solver.seconds_build > 0.0
-    assert result.solver.seconds_solve > 0.0
 
 
 def test_noise_that_does_not_converge_is_reported(session, monkeypatch):

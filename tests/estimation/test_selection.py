@@ -28,24 +28,14 @@ def session():
     return session_of("raw-cycles")
 
 
-def test_the_complete_model_is_the_default(parameters):
+def test_the_complete_model_with_priors_is_the_default_and_offsets_have_none(parameters):
     chosen, full = select_parameters(parameters), select_parameters(parameters, model="full")
     assert (chosen.names, chosen.label) == (full.names, "full")
-
-
-def test_offsets_have_no_prior(parameters):
-    chosen = select_parameters(parameters, model="offsets")
-    assert chosen.names == ("x_slide.offset", "y_slide.offset", "z_slide.offset")
-    assert not chosen.prior.any()
-    assert chosen.label == "offsets"
-
-
-def test_the_full_model_has_the_129_errors_that_change_something(parameters):
-    chosen = select_parameters(parameters, model="full")
-    assert len(chosen.names) == 129
     assert chosen.prior.all()
-    # what coincides structurally is no parameter: along its own axis a slide has its offset
-    assert "x_slide.x" not in parameters
+    offsets = select_parameters(parameters, model="offsets")
+    assert offsets.names == ("x_slide.offset", "y_slide.offset", "z_slide.offset")
+    assert offsets.label == "offsets"
+    assert not offsets.prior.any()
 
 
 def test_globs_come_instead_of_a_model_or_on_top_of_it(parameters):

@@ -26,13 +26,7 @@ from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
 
 
-@pytest.mark.parametrize(
-    ("model", "name"),
-    [
-        ("offsets", "x_slide.rz"),
-        ("lengths", "z_bar_b.z"),
-    ],
-)
+@pytest.mark.parametrize(("model", "name"), [("offsets", "x_slide.rz"), ("lengths", "z_bar_b.z")])
 def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(exact_plan, name, model):
     """Perfect readings of a machine with one small error, calibrated without it."""
     probe = simulate_session(exact_plan, {}, exact=True).session
@@ -43,8 +37,7 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(exact_plan, name,
     problem = build_problem(
         simulate_session(exact_plan, {name: size}, exact=True).session, model=model
     )
-    sigma = fit_problem(build_problem(probe, model=model)).sigma
-    moved = VariableProjection(problem).solve(sigma=sigma).theta / size
+    moved = VariableProjection(problem).solve(sigma=fit.sigma).theta / size
     assert moved == pytest.approx(column, abs=2e-3 * max(1.0, np.abs(column).max()))
 
 
