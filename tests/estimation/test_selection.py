@@ -105,6 +105,7 @@ def test_names_from_an_iterator_are_kept(session):
         ({"model": "full", "known": {"x_leg.length": 1e-4}}, "are partly the same error"),
         ({"free": ["*.offset", "!*"]}, "nothing to identify"),
         ({"free": ["w_*"]}, r"'w_\*' matches no error parameter"),
+        ({"free": ["x_slid.offset"]}, r"did you mean x_slide\.offset"),
         ({"model": "all"}, "'all' is not a model"),
         ({"prior_stds": {"x_leg.length": 1e-4}}, "matches no free parameter"),
         ({"prior_stds": {"*.offset": 1e-12}}, "is 2e-09 mm; expected at least 2e-06 mm"),

@@ -30,6 +30,10 @@ def test_the_orthoglide_is_the_designed_machine(orthoglide):
     assert all(abs(leg.length - 0.31025) < KINEMATICS for leg in r.legs.values())
     assert np.array_equal(r.legs["y"].axis, [0.0, -1.0, 0.0])
     assert all(leg.root_driven for leg in r.legs.values())
+    with pytest.raises(ValueError, match="read-only"):
+        r.reference_posture[0] = 1.0
+    assert r.closure_rows == 18
+    assert [c.rows for c in r.closures] == [(0, 2)] * 3 + [(0, 1, 2, 3, 4, 5)] * 2
 
 
 def test_joint_axes_and_origins_are_those_of_the_design(orthoglide):
@@ -133,11 +137,6 @@ def test_a_machine_may_be_a_single_joint(tmp_path, pairs):
     assert "slide.offset" in robot.parameters.complete
     error = ToolSensitivity(robot, free=["slide.offset"])([0.0], passive=np.zeros((1, 0)))
     assert np.abs(error[0, :, 0] - [1.0, 0.0, 0.0]).max() < KINEMATICS
-
-
-def test_read_only_arrays_cannot_be_written_to(orthoglide):
-    with pytest.raises(ValueError, match="read-only"):
-        orthoglide.reference_posture[0] = 1.0
 
 
 def test_the_same_files_give_the_same_robot_until_one_is_changed(root, tmp_path):
