@@ -16,18 +16,16 @@ from orthocal.builder.machine_file import KINDS, MACHINE, Counting, read_machine
 from orthocal.builder.orthoglide import FEET, Orthoglide
 from orthocal.errors import RobotError
 from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.robot.loading import packaged_robots
 
 SMALL = Orthoglide(leg=0.25, travel=(0.1, 0.32), attachment=0.03, rods_apart=0.06, rod_radius=0.004)
 
 
-def test_the_packaged_machine_comes_out_of_its_own_sizes():
-    folder = packaged_robots()["orthoglide"]
-    made = describe_machine(Orthoglide(), name="orthoglide")
-    assert FEET in made["orthoglide.yaml"]
-    keys = yaml.safe_load(made["orthoglide.yaml"])
+def test_a_made_machine_has_adjustable_feet_beside_the_keys_of_its_kind():
+    (text,) = (t for n, t in describe_machine(SMALL, name="mine").items() if n == "mine.yaml")
+    assert FEET in text
+    keys = yaml.safe_load(text)
     assert len(keys["orthocal"].pop("adjustments")) == 15
-    assert keys == yaml.safe_load((folder / "orthoglide.yaml").read_text())
+    assert keys == yaml.safe_load(SMALL.yaml())
 
 
 @pytest.mark.parametrize("sizes", [SMALL, Orthoglide(leg=0.5, travel=(0.3, 0.7))])
@@ -132,17 +130,16 @@ def test_a_file_without_a_kind_is_of_an_orthoglide(tmp_path):
     text = file.read_text()
     file.write_text(text.replace("kind: orthoglide\n", ""))
     assert read_machine(file)[0] == SMALL
-    file.write_text(text.replace("orthoglide", "hexaglide"))
-    with pytest.raises(RobotError, match=r"machine\.yaml: kind: found 'hexaglide'; expected ortho"):
-        read_machine(file)
-    file.write_text(text.replace("orthoglide", "[]"))
-    with pytest.raises(RobotError, match=r"machine\.yaml: kind: found \[\]; expected orthoglide"):
-        read_machine(file)
     file.write_text(text.replace("orthoglide", "biglide").replace("  z_slide", "  # z_slide"))
     assert read_machine(file)[0].find_problem() is None
-    file.write_text(text.replace("orthoglide", "biglide"))
-    with pytest.raises(RobotError, match=r"machine\.yaml: joints\.z_slide: unknown key"):
-        read_machine(file)
+    for kind, message in (
+        ("hexaglide", r"kind: found 'hexaglide'; expected ortho"),
+        ("[]", r"kind: found \[\]; expected orthoglide"),
+        ("biglide", r"joints\.z_slide: unknown key"),
+    ):
+        file.write_text(text.replace("orthoglide", kind))
+        with pytest.raises(RobotError, match=rf"machine\.yaml: {message}"):
+            read_machine(file)
 
 
 @pytest.mark.parametrize(
