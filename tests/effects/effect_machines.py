@@ -104,11 +104,6 @@ class Outcome:
     at_bound: int
     """Backlashes that are estimated as 0."""
 
-    @property
-    def ratio(self):
-        """RMS tool error over the predicted one."""
-        return rms(self.found) / rms(self.predicted)
-
 
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
@@ -230,18 +225,8 @@ class EffectMachines:
             truth: Shape (count, n_free), [SI].
             rng: Random generator of the noise.
         """
-        return self.identify_values(truth, self.read(truth, rng), self.machines(truth))
-
-    def identify_values(self, truth, values, machines):
-        """Identify machines from readings, perhaps of machines with other effects.
-
-        Args:
-            truth: Shape (count, n_free), [SI].
-            values: Shape (count, n_entries), [m].
-            machines: The independent machines.
-        """
         problem, n = self.problem, self.problem.n_machine
-        solved = BatchSolver(problem).solve(values, sigma=SIGMA)
+        solved = BatchSolver(problem).solve(self.read(truth, rng), sigma=SIGMA)
         free = problem.machine_selection.names
         sensitivity = ToolSensitivity(self.plan.robot, free=free)(self.commands)
 
@@ -266,7 +251,7 @@ class EffectMachines:
             covered_backlash.extend(np.abs(true - theta)[backlash] < limit * stds[backlash])
             predicted.append(predict(covariance))
         return Outcome(
-            self.tool_errors(machines, solved.theta),
+            self.tool_errors(self.machines(truth), solved.theta),
             np.array(predicted),
             predict(self.covariance(np.zeros(problem.n_free))),
             np.array(covered),

@@ -42,7 +42,7 @@ orthocal:
 """
 
 
-SEEDS = 16
+SEEDS = 10
 """Sessions whose deviations are compared with the predicted ones."""
 
 VALIDATED = 6
