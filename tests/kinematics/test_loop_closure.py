@@ -70,30 +70,12 @@ def test_batches_equal_the_newton_iteration_of_pinocchio(orthoglide):
         assert np.abs(ours - theirs).max() < CLOSED
 
 
-def test_closures_hold_at_the_solution(orthoglide):
-    joints = closed_form.inverse(reachable_points(50, seed=6), length=LENGTH)
-    for d, p in zip(joints, LoopClosure(orthoglide).close(joints), strict=True):
-        residual, jacobian = orthoglide.evaluate_constraints(d, p)
-        assert np.abs(residual).max() < CLOSED
-        assert np.linalg.matrix_rank(jacobian[:, orthoglide.passive_index]) == 18
-
-
 def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
     passive = orthoglide.reference_passive
     _, jacobian = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)
     scaled = jacobian[:, orthoglide.passive_index] * closure_row_units(orthoglide)[:, None]
     values = np.linalg.svd(scaled, compute_uv=False)
     assert 1 / 30 < values[-1] / values[0] < 1 / 10
-
-
-def test_a_robot_with_redundant_closure_rows_closes(fivebar):
-    """Gepetto's three keys only: a planar loop with all six rows, three of them dependent."""
-    assert fivebar.closure_rows == 6
-    motors = np.array([[0.0, 0.0], [0.2, -0.1], [-0.4, 0.3]])
-    passive = nominal_closure(fivebar).close(motors)
-    for d, p in zip(motors, passive, strict=True):
-        residual, _ = fivebar.evaluate_constraints(d, p)
-        assert np.abs(residual).max() < CLOSED
 
 
 @pytest.mark.parametrize(
@@ -112,14 +94,6 @@ def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
     pin.framesForwardKinematics(fivebar.model, data, q)
     reached = data.oMf[fivebar.frame_id("end_a")].translation
     assert np.abs(reached - [apex.real, apex.imag, 0.0]).max() < CLOSED_FORM
-
-
-def test_another_robot_goes_the_same_way(biglide):
-    points = np.random.default_rng(8).uniform(-0.05, 0.05, (100, 2))
-    joints = np.sqrt(0.2**2 - points[:, ::-1] ** 2) + points
-    closure = nominal_closure(biglide)
-    assert np.abs(closure.inverse(points) - joints).max() < CLOSED_FORM
-    assert np.abs(closure.forward(joints)[:, :2] - points).max() < CLOSED_FORM
 
 
 def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):

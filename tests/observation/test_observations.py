@@ -62,22 +62,6 @@ def test_linearisation_error_grows_with_the_square_of_the_offsets(experiment_2, 
     assert abs(error - expected_mm * 1e-3) < THREE_DECIMALS_MM
 
 
-def test_a_negative_direction_turns_the_sign(raw_cycles):
-    o = build_observations(raw_cycles)
-    errors = {"x_slide.offset": 1e-3}
-    turned = {
-        n: replace(s, sensor=replace(s.sensor, direction=f"-{s.sensor.direction}"))
-        for n, s in raw_cycles.setups.items()
-    }
-    there = predict_readings(replace(raw_cycles, setups=turned), errors, observations=o)
-    assert np.abs(there + predict_readings(raw_cycles, errors, observations=o)).max() < KINEMATICS
-
-
-def test_a_perfect_machine_shows_no_deviation(raw_cycles):
-    o = build_observations(raw_cycles)
-    assert np.abs(predict_readings(raw_cycles, observations=o)).max() < KINEMATICS * 10
-
-
 def test_offsets_that_the_controller_corrects_do_not_show(raw_cycles):
     offsets = np.array([1.2e-3, -0.8e-3, 0.5e-3])
     postures = {n: replace(p, drives=p.drives - offsets) for n, p in raw_cycles.postures.items()}
