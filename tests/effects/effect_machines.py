@@ -50,13 +50,8 @@ BETWEEN = timedelta(minutes=1)
 
 
 def write_plan(folder, *, between=BETWEEN, growing=False):
-    """A plan of 60 readings with conditions, on a machine with all effects.
-
-    Args:
-        folder: Directory to write.
-        between: Time between two readings.
-        growing: Let the temperature grow with the time; otherwise it goes up and down.
-    """
+    """A plan of 60 readings on a machine with all effects; the temperature grows with the time, or
+    goes up and down."""
     write_robot(folder / "machine", KEYS)
     postures, setups = {}, {}
     rows = ["setup,posture,reading_mm,approach,temperature_C,time"]
@@ -65,11 +60,8 @@ def write_plan(folder, *, between=BETWEEN, growing=False):
             postures[f"{leg}{d:+.0f}"] = {"tcp_mm": [d * (k == leg) for k in "xyz"]}
     for leg in "xyz":
         for direction in sorted(set("xyz") - {leg}):
-            setups[direction + leg] = {
-                "leg": leg,
-                "direction": direction,
-                "section": {"fraction": 0.5},
-            }
+            keys = {"leg": leg, "direction": direction, "section": {"fraction": 0.5}}
+            setups[direction + leg] = keys
     for i, name in enumerate(setups):
         for d in ALONG:
             for letter in "pn":
@@ -110,13 +102,8 @@ def rms(values):
 
 
 class EffectMachines:
-    """Machines with all errors of geometry and some effects, and a model of them.
-
-    Args:
-        folder: Directory of the plan (`write_plan`).
-        effects: Effects of the model.
-        temperature: Of all readings and of use, [°C]; by default those of the plan.
-    """
+    """Machines with all errors of geometry and some effects, and a model of them; all readings and
+    the use are at one temperature, [°C], if it is stated."""
 
     def __init__(self, folder, effects, *, temperature=None):
         self.folder, self.effects, self.temperature = folder / "machine", effects, temperature
@@ -219,12 +206,7 @@ class EffectMachines:
         return np.array([measure_deviations(a, self.workspace, points).aligned.rms for a in apart])
 
     def identify(self, truth, rng):
-        """Identify machines from their readings.
-
-        Args:
-            truth: Shape (count, n_free), [SI].
-            rng: Random generator of the noise.
-        """
+        """Identify machines with parameters of shape (count, n_free), [SI], from their readings."""
         problem, n = self.problem, self.problem.n_machine
         solved = BatchSolver(problem).solve(self.read(truth, rng), sigma=SIGMA)
         free = problem.machine_selection.names

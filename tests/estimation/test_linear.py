@@ -9,7 +9,6 @@ from tolerances import KINEMATICS, PRINTED
 
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.linear import (
-    SIX_ROWS,
     TWELVE_ROWS,
     invert_equation_8,
     leg_parallelism_matrix,
@@ -28,13 +27,6 @@ def test_coefficients_are_those_of_equation_7():
     assert np.abs(matrix[TWELVE_ROWS.index("yx-")] - [-0.06050, -0.32232, 0]).max() < PRINTED
     # the last block of (8) is (Δx_z, Δz_x)
     assert np.abs(matrix[TWELVE_ROWS.index("xz+")] - [0.19339, 0, 0.13668]).max() < PRINTED
-
-
-def test_the_reduced_rows_are_maximum_less_minimum():
-    twelve, six = (leg_parallelism_matrix(**GEOMETRY, rows=n) for n in (12, 6))
-    for i, name in enumerate(SIX_ROWS):
-        a, b = (twelve[TWELVE_ROWS.index(name + sign)] for sign in "+-")
-        assert np.abs(six[i] - (a - b)).max() < KINEMATICS
 
 
 def test_singular_values_of_the_six_equations():

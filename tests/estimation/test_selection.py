@@ -49,9 +49,8 @@ def test_globs_come_instead_of_a_model_or_on_top_of_it(parameters):
 
 
 def test_a_tolerance_holds_for_what_its_glob_matches(parameters):
-    chosen = select_parameters(
-        parameters, model="lengths", prior_stds={"*.offset": 2e-3, "x_slide.offset": 1e-3}
-    )
+    stds = {"*.offset": 2e-3, "x_slide.offset": 1e-3}
+    chosen = select_parameters(parameters, model="lengths", prior_stds=stds)
     assert chosen.prior_stds == pytest.approx([1e-3, 2e-3, 2e-3, 1e-4, 1e-4, 1e-4])
 
 
@@ -82,9 +81,7 @@ def test_bounds_below_zero_of_a_parameter_that_is_never_negative_are_refused(ses
     chosen = select(-1e-3, 1e-3)
     assert (chosen.lower[-1], chosen.upper[-1]) == (0.0, 1e-3)
     for high in (-1e-3, 0.0):
-        with pytest.raises(
-            ParameterError, match=r"'x_slide\.backlash' is never negative"
-        ) as raised:
+        with pytest.raises(ParameterError, match="backlash' is never negative") as raised:
             select(-2e-3, high)
         assert raised.value.where == "bounds"
 
@@ -113,10 +110,7 @@ def test_names_from_an_iterator_are_kept(session):
         ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "bounds: the lower bound of"),
         ({"known": {"x_slid.offset": 0.0}}, "did you mean x_slide.offset"),
         ({"known": {"x_slide.offset": float("nan")}}, "expected a finite number"),
-        (
-            {"known": {"x_slide.offset": (0.0, 0.0)}},
-            "known: the tolerance of 'x_slide.offset' is 0",
-        ),
+        ({"known": {"x_slide.offset": (0.0, 0.0)}}, "the tolerance of 'x_slide.offset' is 0"),
     ],
 )
 def test_choices_that_make_no_sense_are_refused(parameters, choice, message):
@@ -161,11 +155,7 @@ def test_texts_carry_their_units(parameters):
         (read_known, "x_slide.offset_mm=1±", "expected a number"),
         (read_known, "x_slide.offset_mm=1±a", "expected a number"),
         (read_known, "x_slide.offset_mrad=1", "has the wrong unit"),
-        (
-            read_tolerances,
-            "*.offset_mrad=1",
-            "x_slide.offset, which it matches, is in mm",
-        ),
+        (read_tolerances, "*.offset_mrad=1", "x_slide.offset, which it matches, is in mm"),
         (read_tolerances, "w.offset_mm=1", "matches no error parameter"),
         (read_bounds, "x_slide.offset_mm=:", "expected NAME=LOWEST:HIGHEST"),
         (read_bounds, "x_slide.offset_mm=1", "expected NAME=LOWEST:HIGHEST"),

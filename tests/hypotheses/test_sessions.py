@@ -49,15 +49,8 @@ def plan():
 
 
 def measure_twice(plan, active, *, before=(0.0, 0.0, 0.0), changed=0.0, seed=1):
-    """Two joined sessions of one machine, the second with other offsets than it states.
-
-    Args:
-        plan: The readings of both.
-        active: Offsets in the controller of the second session, which states `ENTERED`.
-        before: Offsets in the controller of the first session, which states them.
-        changed: Change of the offset of the second drive between the sessions, [m].
-        seed: Of the machine and its readings.
-    """
+    """Two joined sessions of one machine with stated offsets: `before` in the first, `ENTERED` in
+    the second one, while `active` are in the controller and the second drive has `changed`."""
     robot = plan.robot
     errors = draw_errors(robot, machine_errors(robot), seed=seed)
     names = [f"{d.name}.offset" for d in robot.drives]
@@ -66,11 +59,12 @@ def measure_twice(plan, active, *, before=(0.0, 0.0, 0.0), changed=0.0, seed=1):
     for name, stated, value in zip(names, ENTERED, active, strict=True):
         second[name] += stated - value
     second[names[1]] += changed
-    sessions = [
-        simulate_session(plan.with_controller(before), errors, seed=seed).session,
-        simulate_session(plan.with_controller(ENTERED), second, seed=seed + 100).session,
-    ]
-    return join_sessions(sessions)
+    return join_sessions(
+        [
+            simulate_session(plan.with_controller(before), errors, seed=seed).session,
+            simulate_session(plan.with_controller(ENTERED), second, seed=seed + 100).session,
+        ]
+    )
 
 
 def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, tmp_path):
@@ -171,12 +165,7 @@ def test_wrong_offsets_are_listed_once():
     entered = {tuple(np.round(c, 9)) for _, _, c in ways}
     assert len(entered) == len(ways)
     assert tuple(stated) not in entered
-    assert {kind for kind, _, _ in ways} == {
-        "offsets not entered",
-        "offsets reversed",
-        "offsets entered twice",
-        "offsets interchanged",
-    }
+    assert {kind for kind, _, _ in ways} == {kind for kind, _ in WAYS.values()}
     assert list(enter_wrongly(before, before)) == []
 
 
@@ -187,14 +176,7 @@ def sided():
 
 
 def compensate(plan, backlash, parts, *, seed=1):
-    """Session of a machine whose controller compensates parts of the stated backlash.
-
-    Args:
-        plan: The readings.
-        backlash: That of each drive, which the session states, [m].
-        parts: Compensation of the controller relative to the stated one, of each drive.
-        seed: Of the readings.
-    """
+    """Session of a machine whose controller compensates these parts of the stated backlash."""
     errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
     errors |= {f"{d.name}.offset": 0.0 for d in plan.robot.drives}
     errors |= {f"{d.name}.backlash": backlash for d in plan.robot.drives}
@@ -256,11 +238,6 @@ def test_each_wrong_backlash_is_considered_once():
     ]
 
 
-def place(session, row):
-    r = session.readings[row]
-    return r.setup, r.posture, r.minus, r.cycle
-
-
 def test_the_order_of_rows_does_not_change_a_reversed_sign(raw_cycles):
     session = raw_cycles.select([r for r in raw_cycles.readings if r.cycle <= 2])
     values = session.values
@@ -272,7 +249,7 @@ def test_the_order_of_rows_does_not_change_a_reversed_sign(raw_cycles):
     one, other = find_anomalies(session), find_anomalies(shuffled)
     (first,), (second,) = one.found, other.found
     assert first.explanation.kind == second.explanation.kind == "reversed sign"
-    assert place(session, first.explanation.rows[0]) == place(shuffled, second.explanation.rows[0])
+    assert first.explanation.rows[0] == order[second.explanation.rows[0]]
     assert second.log_evidence == pytest.approx(first.log_evidence, abs=1e-6)
     assert second.expected == pytest.approx(first.expected, abs=1e-9)
 
@@ -410,17 +387,14 @@ def test_a_change_that_may_be_zero_is_no_cause(plan):
 
 def test_no_machine_changes_by_a_hundred_tolerances(plan):
     """Readings of the second session that a change of 200 prior standard deviations explains."""
-    session = measure_twice(plan, ENTERED, seed=0)
+    session, tilt = measure_twice(plan, ENTERED, seed=0), "y_slide.rz"
     model = LinearModel(session)
-    column = model.at_reference(keep_jacobian=True).jacobian[:, model.problem.free.index(TILT)]
+    column = model.at_reference(keep_jacobian=True).jacobian[:, model.problem.free.index(tilt)]
     values = session.values + 200.0 * np.where(model.session_of_entry == 1, column, 0.0)
     explanations = [a.explanation for a in find_anomalies(session.with_values(values)).found]
     sizes = [abs(e.amount) for e in explanations if e.kind == "machine changed"]
     assert sizes
-    assert max(sizes) < 100.0 * plan.robot.parameters[TILT].prior_std
-
-
-TILT = "y_slide.rz"
+    assert max(sizes) < 100.0 * plan.robot.parameters[tilt].prior_std
 
 
 def test_the_order_in_which_sessions_are_joined_does_not_matter(plan):

@@ -64,21 +64,14 @@ def write_plan(
     folder, robot, controller="", setup_a="{leg: a, direction: y, section: {fraction: 0.3}}"
 ):
     folder.mkdir()
-    postures = {f"p{i}{k}": (6.0 * i, 6.0 * k) for i in (-1, 0, 1) for k in (-1, 0, 1)}
-    lines = [f"  {name}: {{joints_deg: [{a}, {b}]}}" for name, (a, b) in postures.items()]
-    text = "\n".join(
-        [
-            f"robot: {robot}",
-            "gauge: {sigma_mm: 0.005}",
-            *([f"controller: {controller}"] if controller else []),
-            "postures:",
-            *lines,
-            "setups:",
-            f"  ya: {setup_a}",
-            "  yb: {leg: b, direction: y, section: {fraction: 0.7}}",
-        ]
+    angles = [(i, k) for i in (-1, 0, 1) for k in (-1, 0, 1)]
+    postures = [f"  p{i}{k}: {{joints_deg: [{6.0 * i}, {6.0 * k}]}}\n" for i, k in angles]
+    (folder / "session.yaml").write_text(
+        f"robot: {robot}\ngauge: {{sigma_mm: 0.005}}\n"
+        + (f"controller: {controller}\n" if controller else "")
+        + f"postures:\n{''.join(postures)}setups:\n  ya: {setup_a}\n"
+        "  yb: {leg: b, direction: y, section: {fraction: 0.7}}\n"
     )
-    (folder / "session.yaml").write_text(text + "\n")
     return folder
 
 
@@ -243,13 +236,10 @@ def test_angles_of_an_ini_file_are_in_degrees(tmp_path, units, joint, where):
 @pytest.mark.parametrize(
     ("controller", "message"),
     [
-        (
-            "{offsets_mm: [1, 2, 3], offsets_deg: [3]}",
-            "has 3 numbers; expected 2, one per prismatic drive: slide, lift",
-        ),
+        ("{offsets_mm: [1, 2, 3], offsets_deg: [3]}", "expected 2, one per prismatic drive: slide"),
         (
             "{offsets_mm: [1, 2]}",
-            "controller: the offset of drive turn is missing; add offsets_deg or offsets_mrad",
+            "controller: the offset of drive turn is missing; add offsets_deg",
         ),
         ("{offsets_mrad: [1]}", "controller: the offset of drive slide is missing; add offsets_mm"),
     ],

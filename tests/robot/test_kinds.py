@@ -232,32 +232,27 @@ def drawn_points(visual):
     return sorted((*p, last) for p in placed.tolist())
 
 
-def test_the_packaged_orthoglide_is_one_of_the_kinds():
+def test_the_packaged_orthoglide_is_one_of_the_kinds(tmp_path, orthoglide):
     """Joints, placements, limits and drawings of the robot that was written by hand."""
-    folder, machine = packaged_robots()["orthoglide"], Orthoglide()
+    machine = Orthoglide()
+    models = [written(tmp_path, machine, "orthoglide").model, orthoglide.model]
+    for a, b in zip(*(m.frames for m in models), strict=True):
+        assert (a.name, a.type, a.parentJoint) == (b.name, b.type, b.parentJoint)
+        assert np.abs(a.placement.homogeneous - b.placement.homogeneous).max() < 1e-15
+    for a, b in zip(*(zip(m.names, m.joints, strict=True) for m in models), strict=True):
+        assert (a[0], a[1].shortname()) == (b[0], b[1].shortname())
+    # to the last bit: ties in plans depend on it
+    exact = [
+        [*m.lowerPositionLimit, *m.upperPositionLimit, *(p.homogeneous for p in m.jointPlacements)]
+        for m in models
+    ]
+    assert all(np.array_equal(a, b) for a, b in zip(*exact, strict=True))
     made = etree.fromstring(machine.urdf("orthoglide").encode())
-    packaged = etree.parse(str(folder / "orthoglide.urdf")).getroot()
-    for kind in ("joint", "link"):
-        pairs = list(zip(made.iterfind(kind), packaged.iterfind(kind), strict=True))
-        assert all(a.get("name") == b.get("name") for a, b in pairs)
-        if kind == "link":
-            for a, b in pairs:
-                drawn = [[drawn_points(v) for v in link.iterfind("visual")] for link in (a, b)]
-                assert drawn[0] == drawn[1], a.get("name")
-            continue
-        for a, b in pairs:
-            for tag in ("parent", "child", "axis", "limit"):
-                x, y = a.find(tag), b.find(tag)
-                assert (x is None) == (y is None)
-                assert x is None or dict(x.attrib) == dict(y.attrib), a.get("name")
-            x, y = a.find("origin"), b.find("origin")
-            turned = [rpyToMatrix(numbers(o, "rpy")) for o in (x, y)]
-            assert np.abs(turned[0] - turned[1]).max() < 1e-15
-            for key in ("xyz", "rpy") if a.get("type") != "fixed" else ("xyz",):
-                # to the last bit: ties in plans depend on it
-                assert numbers(x, key).tolist() == numbers(y, key).tolist(), a.get("name")
-    read = (folder / "orthoglide.yaml").read_text()
-    assert yaml.safe_load(machine.yaml()) == yaml.safe_load(read)
+    packaged = etree.parse(str(orthoglide.urdf)).getroot()
+    for a, b in zip(made.iterfind("link"), packaged.iterfind("link"), strict=True):
+        drawn = [[drawn_points(v) for v in link.iterfind("visual")] for link in (a, b)]
+        assert drawn[0] == drawn[1], a.get("name")
+    assert yaml.safe_load(machine.yaml()) == yaml.safe_load(orthoglide.yaml.read_text())
 
 
 @pytest.mark.parametrize(
@@ -265,6 +260,13 @@ def test_the_packaged_orthoglide_is_one_of_the_kinds():
     [
         (InclinedOrthoglide(elevation=19.9 * DEG), "elevation", "slides at 19.9°; expected 20"),
         (InclinedOrthoglide(leg=250.0), "leg", "legs of 250000 mm; expected 20 to 5000 mm"),
+        (Orthoglide(leg=250.0), "leg", "legs of 250000 mm; expected 20 to 5000 mm"),
+        (Orthoglide(leg=float("nan")), "leg", "legs of nan mm"),
+        (Orthoglide(leg=0.4), "travel", "does not include 400 mm, the leg length"),
+        (Orthoglide(travel=(0.12, 0.65)), "travel", "legs of 310.25 mm reach 31.025 to 589.475"),
+        (Orthoglide(attachment=-0.01), "attachment", "hinges -10 mm from the tool centre point"),
+        (Orthoglide(rods_apart=0.01), "rod_radius", "rods of radius 5.5 mm, 10 mm apart"),
+        (Orthoglide(rod_radius=0.0), "rod_radius", "rods of radius 0 mm"),
         (LinearDelta(rod=280.0), "rod", "rods of 280000 mm"),
         (LinearDelta(radius=0.27), "radius", "delta radius of 270 mm; expected 56 to 252 mm"),
         (LinearDelta(angles=(0.0, 1.0, 3.0)), "angles", "towers at 0, 57.295779513, 171.887338"),

@@ -42,25 +42,9 @@ def test_a_machine_of_other_sizes_moves_as_the_papers_equations_say(tmp_path, si
     assert apart == pytest.approx(sizes.rods_apart)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"leg": 250.0}, "legs of 250000 mm; expected 20 to 5000 mm"),
-        ({"leg": 0.4}, "does not include 400 mm, the leg length"),
-        (
-            {"travel": (0.12, 0.65)},
-            "travel from 120 to 650 mm; legs of 310.25 mm reach 31.025 to 589.475",
-        ),
-        ({"attachment": -0.01}, "hinges -10 mm from the tool centre point; expected 0"),
-        ({"rods_apart": 0.01}, "rods of radius 5.5 mm, 10 mm apart; expected them to clear"),
-        ({"rod_radius": 0.0}, "rods of radius 0 mm"),
-        ({"leg": float("nan")}, "legs of nan mm"),
-    ],
-)
-def test_sizes_that_make_no_machine_are_refused(tmp_path, change, message):
-    with pytest.raises(RobotError, match="dimensions") as e:
-        make_robot(Orthoglide(**change), tmp_path / "mine")
-    assert message in str(e.value)
+def test_dimensions_that_make_no_machine_are_refused(tmp_path):
+    with pytest.raises(RobotError, match=r"dimensions.*does not include 400 mm, the leg length"):
+        make_robot(Orthoglide(leg=0.4), tmp_path / "mine")
     assert not (tmp_path / "mine").exists()
 
 
