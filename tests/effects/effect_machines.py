@@ -24,7 +24,6 @@ from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, cube
 from orthocal.observation.observations import drive_table
-from orthocal.session.session import Conditions
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.information import decompose
 
@@ -106,10 +105,13 @@ class EffectMachines:
     the use are at one temperature, [°C], if it is stated."""
 
     def __init__(self, folder, effects, *, temperature=None):
-        self.folder, self.effects, self.temperature = folder / "machine", effects, temperature
+        self.folder, self.effects = folder / "machine", effects
         self.plan = load_plan(folder).with_effects(list(effects))
         if temperature is not None:
-            self.plan = replace(self.plan, readings=tuple(map(self._tempered, self.plan.readings)))
+            readings = self.plan.readings
+            stated = (replace(r.conditions, temperature=temperature) for r in readings)
+            readings = [replace(r, conditions=c) for r, c in zip(readings, stated, strict=True)]
+            self.plan = replace(self.plan, readings=tuple(readings))
         self.problem = build_problem(self.plan, model="full", prior=True, prior_stds=OFFSETS)
         robot = self.plan.robot
         closure = LoopClosure(robot)
@@ -122,12 +124,6 @@ class EffectMachines:
             np.full(len(points), used_at),
         )
         self.workspace = Workspace.even(points)
-
-    def _tempered(self, reading):
-        stated = reading.conditions
-        return replace(
-            reading, conditions=Conditions(stated.approach, self.temperature, stated.time)
-        )
 
     def draw(self, rng, count):
         """Errors and nuisance parameters at their priors, shape (count, n_free), [SI]."""

@@ -58,6 +58,7 @@ TRUTH = {
     "rods.growth": 9e-6,
 }
 FREE = ("*.offset", "*.slack", "*.wave", "rods.growth")
+SOLVERS = (VariableProjection, NonlinearProgram)
 QUICK = {"solver": "variable-projection"}
 
 
@@ -314,18 +315,13 @@ def simulated(plan):
     return simulate_session(plan, TRUTH, seed=6, sigma=0.2e-6)
 
 
-def solutions(problem, sigma):
-    """Solutions with variable projection and with Ipopt."""
-    return [P(problem).solve(sigma=sigma) for P in (VariableProjection, NonlinearProgram)]
-
-
 def test_estimates_of_slack_are_never_negative(plan):
     """Without slack half of the unbounded estimates would be negative."""
     exact_plan = exact(plan)
     without = {n: v for n, v in TRUTH.items() if not n.endswith("slack")}
     session = simulate_session(exact_plan, without, seed=3, sigma=1e-6).session
     problem = build_problem(session, free=FREE, prior=True)
-    projected, program = solutions(problem, 1e-6)
+    projected, program = (P(problem).solve(sigma=1e-6) for P in SOLVERS)
     of_slack = [i for i, n in enumerate(problem.free) if n.endswith("slack")]
     assert (projected.theta[of_slack] >= 0.0).all()
     assert (projected.at_bound[of_slack] == program.at_bound[of_slack]).all()

@@ -38,10 +38,8 @@ def test_a_bound_holds_a_parameter_and_changes_the_others(session):
     assert list(fit.solution.at_bound) == [1, 0, 0]
     assert fit.solution.theta[0] == pytest.approx(0.9e-3, abs=1e-8)
     linear = linearise_problem(build_problem(session, model="offsets"))
-    low = np.array([-1e-3, -np.inf, -np.inf]) / 5e-3
-    high = np.array([0.9e-3, np.inf, np.inf]) / 5e-3
-    bounds = (low, high)
-    expected = lsq_linear(linear.jacobian, linear.residual, bounds=bounds, tol=1e-15).x * 5e-3
+    scaled = [[low / 5e-3, *[end] * 2] for low, end in ((-1e-3, -np.inf), (0.9e-3, np.inf))]
+    expected = lsq_linear(linear.jacobian, linear.residual, bounds=scaled, tol=1e-15).x * 5e-3
     assert np.abs(fit.solution.theta - expected).max() < LINEAR
     assert fit.linearised_theta == pytest.approx(expected, abs=1e-9)
 

@@ -59,12 +59,9 @@ def measure_twice(plan, active, *, before=(0.0, 0.0, 0.0), changed=0.0, seed=1):
     for name, stated, value in zip(names, ENTERED, active, strict=True):
         second[name] += stated - value
     second[names[1]] += changed
-    return join_sessions(
-        [
-            simulate_session(plan.with_controller(before), errors, seed=seed).session,
-            simulate_session(plan.with_controller(ENTERED), second, seed=seed + 100).session,
-        ]
-    )
+    one = simulate_session(plan.with_controller(before), errors, seed=seed).session
+    other = simulate_session(plan.with_controller(ENTERED), second, seed=seed + 100).session
+    return join_sessions([one, other])
 
 
 def test_a_drive_that_slipped_leads_to_the_offsets_of_the_present_machine(plan, tmp_path):
@@ -191,9 +188,8 @@ def compensate(plan, backlash, parts, *, seed=1):
 )
 def test_backlash_that_the_controller_does_not_compensate_as_stated_is_named(sided, parts, kind):
     first = replace(compensate(sided, 0.12e-3, (0.0, 0.0, 0.0)), compensation=())
-    (found,) = find_anomalies(
-        join_sessions([first, compensate(sided, 0.12e-3, parts, seed=2)])
-    ).found
+    second = compensate(sided, 0.12e-3, parts, seed=2)
+    (found,) = find_anomalies(join_sessions([first, second])).found
     e = found.explanation
     assert (e.kind, e.sessions, found.alternatives) == (kind, ("session-2",), ())
     assert e.drives == tuple(f"{d}_slide" for d in "xyz")
@@ -368,12 +364,9 @@ def test_a_change_that_may_be_zero_is_no_cause(plan):
     session = measure_twice(plan, ENTERED, changed=0.3e-3)
     search = _Search(session, linear_model(session))
     families = list_families(search.model, Rows(session), grouped=False)
+    terms = [(f, h, f.explain(h)) for f in families if not f.known for h in range(f.count)]
     drives = {
-        e.drives: search.scorer.term(family, h)
-        for family in families
-        if not family.known
-        for h in range(family.count)
-        if (e := family.explain(h)).kind == "offset of one drive"
+        e.drives: search.scorer.term(f, h) for f, h, e in terms if e.kind == "offset of one drive"
     }
     moved, other = drives["y_slide",], drives["z_slide",]
     alone, both = search.sets.evaluate_all([(moved,), (moved, other)], search.sound.about)
@@ -404,11 +397,10 @@ def test_the_order_in_which_sessions_are_joined_does_not_matter(plan):
     errors = draw_errors(wide.robot, machine_errors(wide.robot), seed=0)
     errors.update(zip((f"{d.name}.offset" for d in wide.robot.drives), large, strict=True))
     moved = errors | {"y_slide.offset": large[1] + 0.6e-3}
+    machines = ((0.0, errors), (0.97, errors), (1.0, errors), (1.0, moved))
     first, second, third, last = (
-        simulate_session(wide.with_controller(active), machine, seed=seed).session
-        for seed, (active, machine) in enumerate(
-            ((0.0 * large, errors), (0.97 * large, errors), (large, errors), (large, moved))
-        )
+        simulate_session(wide.with_controller(share * large), machine, seed=seed).session
+        for seed, (share, machine) in enumerate(machines)
     )
     assert not find_anomalies(join_sessions([second, first])).found
     (anomaly,) = find_anomalies(join_sessions((last, first, third))).found

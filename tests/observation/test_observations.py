@@ -71,14 +71,6 @@ def test_offsets_that_the_controller_corrects_do_not_show(raw_cycles):
     assert np.abs(shown).max() < KINEMATICS * 10
 
 
-def test_readings_are_entries_with_one_zero_a_setup(raw_cycles):
-    o = build_observations(raw_cycles)
-    assert o.size == 54
-    assert o.n_zeros == 6
-    assert all(o.zero_real)
-    assert np.array_equal(o.rows(o.values(raw_cycles.values)), raw_cycles.values)
-
-
 def test_differences_are_taken_apart_into_readings_with_a_zero_each(tmp_path, root):
     text = (root / "examples/raw-cycles/session.yaml").read_text()
     (tmp_path / "session.yaml").write_text(text)

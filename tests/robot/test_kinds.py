@@ -17,7 +17,6 @@ from tolerances import CLOSED
 from orthocal import load_robot
 from orthocal.builder.biglide import Biglide
 from orthocal.builder.linear_delta import LinearDelta
-from orthocal.builder.machine_file import KINDS
 from orthocal.builder.orthoglide import InclinedOrthoglide, Orthoglide
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -282,13 +281,6 @@ def test_dimensions_that_make_no_machine_are_refused(machine, name, message):
     found = machine.find_problem()
     assert found is not None
     assert (found[0], message in found[1]) == (name, True), found
-
-
-def test_kinds_and_their_usual_dimensions_are_possible():
-    for name, kind in KINDS.items():
-        assert kind.kind == name
-        assert kind().find_problem() is None
-    assert SINGLE.find_problem() is None
 
 
 @pytest.mark.parametrize(("rod", "radius"), [(0.28, 0.14), (0.1277, 0.1), (0.1112, 0.1)])

@@ -51,15 +51,6 @@ def test_dimensions_that_make_no_machine_are_refused(tmp_path):
 COUNTING = (Counting(True, 0.0), Counting(False, 0.0), Counting(True, None))
 
 
-def test_a_machine_counts_as_it_is_told(tmp_path):
-    """Up or down from what the controller shows in the mechanical zero; 10 mm further out."""
-    robot = make_robot(SMALL, tmp_path / "mine", counting=COUNTING)
-    further = robot.drive_zero + 0.01
-    shown = [float(d.to_joint(v)) for d, v in zip(robot.drives, further, strict=True)]
-    assert shown == pytest.approx([0.01, -0.01, 0.26])
-    assert robot.drives[1].joint_limits == pytest.approx((-0.07, 0.15))
-
-
 def test_a_machine_is_made_again_from_its_sizes_in_one_place(tmp_path):
     folder = tmp_path / "mine"
     make_robot(SMALL, folder, counting=COUNTING)
@@ -89,6 +80,8 @@ def test_machines_of_every_kind_are_made_again_from_one_file(tmp_path, kind):
     robot = make_robot(usual, folder, counting=counting, effects=["backlash"])
     assert robot.drive_zero == pytest.approx([usual.zero] * len(usual.letters))
     assert [d.direction for d in robot.drives] == [1, -1, 1][: len(usual.letters)]
+    shown = [float(d.to_joint(d.zero)) for d in robot.drives]
+    assert shown == pytest.approx([0.01 * k for k in range(len(counting))])
     assert robot.effect_names == ("backlash",)
     dimensions, read = read_machine(folder / MACHINE)
     assert read == counting

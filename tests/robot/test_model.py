@@ -6,7 +6,6 @@ import shutil
 
 import linkages
 import numpy as np
-import pinocchio as pin
 import pytest
 from derivatives import assert_derivative
 from tolerances import KINEMATICS
@@ -90,14 +89,6 @@ def test_frame_errors_move_the_frames_that_hang_on_them(orthoglide):
     assert abs(np.linalg.norm(shift["platform"]) - 1e-3) < KINEMATICS
     assert np.abs(shift["tcp"] - shift["platform"]).max() < KINEMATICS
     assert np.abs(shift["x_foot"]).max() == 0.0
-
-
-def test_an_offset_moves_the_slider_by_itself(orthoglide):
-    moved = orthoglide.with_errors({"y_slide.offset": 0.002})
-    data, q = moved.model.createData(), moved.configuration(moved.reference_posture)
-    pin.framesForwardKinematics(moved.model, data, q)
-    slider = data.oMf[moved.frame_id("y_slider")].translation
-    assert np.abs(slider - [0.0, 0.31225, 0.0]).max() < KINEMATICS
 
 
 @pytest.mark.parametrize("pairs", ["", "[slide, post]"])

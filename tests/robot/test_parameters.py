@@ -52,10 +52,3 @@ def test_named_sums_spread_over_their_elementary_errors(orthoglide):
     p = orthoglide.parameters
     found = p.expand({"x_leg.length": 1e-3, "x_coupler.x": 1e-4})
     assert found == {"x_coupler.x": 1.1e-3, "frame.x_rod_b_tip.x": 1e-3}
-
-
-def test_tolerances_are_those_of_the_yaml(orthoglide):
-    p = orthoglide.parameters
-    assert p["x_slide.offset"].prior_std == 5e-3
-    assert p["x_coupler.x"].prior_std == 1e-4
-    assert p["x_coupler.rz"].prior_std == 1e-3

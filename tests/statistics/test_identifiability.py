@@ -164,13 +164,6 @@ def test_lines_resolve_more_combinations_than_the_sweep(jacobians):
     assert ("x_slide.offset", "x_swivel.x", "x_fork.x") in {c.names for c in alike["lines"].alike}
 
 
-def test_the_position_of_the_swivel_along_its_slide_is_an_offset(raw_cycles):
-    choice = Choice(free=["*.offset", "x_swivel.x"], prior=True)
-    result, _ = identify(raw_cycles, choice, **QUICK)
-    words = [c.words for c in result.identifiability.alike]
-    assert words == ["x_slide.offset and x_swivel.x: only their difference"]
-
-
 def test_base_parameters_without_prior_are_the_sums_of_the_truth():
     """Exact readings, to first order."""
     truth = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.3e-3, "x_swivel.x": 0.1e-3}

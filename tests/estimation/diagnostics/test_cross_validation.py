@@ -42,12 +42,6 @@ def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
     assert {r.setup for r in result.residuals if np.isfinite(r.prediction_error)} == {"zx", "xz"}
 
 
-def test_one_setup_alone_predicts_nothing(raw_cycles):
-    rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
-    result = identified(replace(raw_cycles, readings=rows), "lengths")
-    assert all(np.isnan(r.prediction_error) for r in result.residuals)
-
-
 def test_with_a_robust_loss_it_is_the_robust_fit_that_predicts(raw_cycles):
     """Where no residual is large Huber's loss is all but squares, and predicts as they do."""
     wide = SolverOptions(loss=Loss("huber", width=100.0))

@@ -63,28 +63,21 @@ def readings(single_cycle):
 @pytest.fixture(scope="module")
 def absolute(single_cycle):
     """Readings of which two gauges measure absolutely."""
-    setups = {
-        n: replace(s, zero="known" if n in ("yx", "zy") else "free")
-        for n, s in single_cycle.setups.items()
-    }
-    session = simulate_session(replace(single_cycle, setups=setups), TRUTH, seed=5).session
+    known = {n: replace(single_cycle.setups[n], zero="known") for n in ("yx", "zy")}
+    plan = replace(single_cycle, setups=single_cycle.setups | known)
+    session = simulate_session(plan, TRUTH, seed=5).session
     return session.with_gauge(Gauge(None, None, None))
 
 
-@pytest.mark.parametrize(
-    ("form", "model"),
-    [
-        ("readings", "lengths"),
-        ("differences", "offsets"),
-        ("Table 1", "lengths"),
-        ("known zeros", "offsets"),
-    ],
-)
+FORMS = {"readings": "lengths", "differences": "offsets", "Table 1": "lengths", "known": "offsets"}
+
+
+@pytest.mark.parametrize(("form", "model"), FORMS.items())
 def test_leaving_a_row_out_changes_the_estimate_as_predicted(
     readings, absolute, experiment_2, form, model
 ):
     session = {
-        "known zeros": absolute,
+        "known": absolute,
         "readings": readings,
         "differences": differences_of(readings),
         "Table 1": exact(experiment_2),

@@ -181,10 +181,6 @@ def test_a_linear_solver_that_is_not_installed_is_named(experiment_2, capfd):
 
 def test_options_reach_ipopt(experiment_2):
     problem = build_problem(experiment_2, model="offsets")
-    plain = NonlinearProgram(problem).solve(sigma=1e-5)
-    options = {"mu_strategy": "adaptive", "print_timing_statistics": False}
-    other = NonlinearProgram(problem, options=SolverOptions(ipopt=options)).solve(sigma=1e-5)
-    assert np.abs(plain.theta - other.theta).max() < SAME_OPTIMUM
     with pytest.raises(SolverError):
         NonlinearProgram(problem, options=SolverOptions(ipopt={"max_iter": 1})).solve(sigma=1e-5)
     with pytest.raises(ValueError, match="ipopt has"):
