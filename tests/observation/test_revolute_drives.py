@@ -42,7 +42,7 @@ orthocal:
 """
 
 
-SEEDS = 10
+SEEDS = 8
 """Sessions whose deviations are compared with the predicted ones."""
 
 VALIDATED = 6

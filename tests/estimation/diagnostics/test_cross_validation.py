@@ -21,7 +21,7 @@ FIRST_ORDER = 2e-3
 
 
 @pytest.mark.parametrize(
-    ("session", "model"), [("table1/experiment-2", "offsets"), ("sweep", "full")]
+    ("session", "model"), [("table1/experiment-2", "offsets"), ("raw-cycles", "full")]
 )
 def test_leaving_a_setup_out_is_solving_without_it(session, model):
     """Against fits without each setup."""
