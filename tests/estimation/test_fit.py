@@ -130,11 +130,9 @@ def test_parameters_without_sensitivity_are_explained(session):
 
 def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
     """Without tolerance no two estimates agree, so that all rounds end without convergence."""
-    from orthocal.estimation import fit
-
-    assert identified(session, "full").solver.noise_converged
-    monkeypatch.setattr(fit, "SIGMA_TOLERANCE", 0.0)
-    result = calibrate(session, "full", **UNJUDGED)
+    assert identified(session, "lengths").solver.noise_converged
+    monkeypatch.setattr("orthocal.estimation.fit.SIGMA_TOLERANCE", 0.0)
+    result = calibrate(session, "lengths", **UNJUDGED)
     assert not result.solver.noise_converged
     (finding,) = result.assessment.of_kind("no convergence")
     assert finding.severity == "note"

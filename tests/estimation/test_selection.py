@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibrated import session_of
+from calibrated import identified, session_of
 
 from orthocal import draw_errors
-from orthocal.calibration.identify import identify
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice
 from orthocal.estimation.selection import (
@@ -91,7 +90,8 @@ def test_names_from_an_iterator_are_kept(session):
     choice = Choice(free=iter(names), effects=iter(["backlash"]))
     assert choice == Choice(free=tuple(names), effects=("backlash",))
     assert choice.select(session.robot.parameters).names == tuple(names)
-    assert identify(session, choice, profile=iter(names[:1]))[0].free[0].interval is not None
+    result = identified(session, Choice(free=iter(names)), profile=iter(names[:1]))
+    assert result["x_slide.offset"].interval is not None
     assert list(draw_errors(session.robot, iter(names), seed=0)) == names
 
 

@@ -449,7 +449,6 @@ def test_few_sessions_are_divided_in_all_ways():
 def test_a_mistake_casts_no_doubt_on_the_other_session(plan):
     """A second mistake needs clear evidence against the likeliest machine with the first one."""
     sessions = [simulate_session(plan, {"x_slide.offset": 0.5e-3}, seed=k).session for k in (4, 5)]
-    assert not find_anomalies(join_sessions(sessions)).found
     values = sessions[0].values.copy()
     values[4] += 0.7e-3
     (found,) = find_anomalies(join_sessions([sessions[0].with_values(values), sessions[1]])).found
