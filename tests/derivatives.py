@@ -56,3 +56,25 @@ def assert_program_derivatives(f, x, p, *, weight, directions, seed):
     hessian = upper + np.triu(upper, 1).T
     weights = np.r_[weight, multipliers]
     assert_derivative(hessian @ along, lambda t: weights @ gradients(t), zero, step=1e-4)
+
+
+def assert_jacobian(
+    problem, theta, jacobian, *, columns=slice(None), step=1e-3, least=1e-9, tolerance=1e-6
+) -> None:
+    """Compare columns of a Jacobian by scaled parameters with central differences of the readings.
+
+    Args:
+        problem: Problem of an identification.
+        theta: Parameters, shape (n_free,), [SI].
+        jacobian: Shape (n_entries, n_free), [m].
+        columns: Columns that are compared.
+        step: Step in units of the parameters' scales.
+        least: Smallest size of a column to which its error is compared, [m].
+        tolerance: Largest relative error.
+    """
+    steps = step * np.diag(problem.theta_scale)[columns]
+    ahead, behind = np.split(problem.predict(np.vstack([theta + steps, theta - steps])), 2)
+    numeric = (ahead - behind).T / (2.0 * step)
+    size = np.maximum(np.abs(numeric).max(axis=0), least)
+    assert np.isfinite(jacobian).all()
+    assert (np.abs(jacobian[:, columns] - numeric) / size).max() < tolerance

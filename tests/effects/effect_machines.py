@@ -24,7 +24,6 @@ from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, cube
 from orthocal.observation.observations import drive_table
-from orthocal.session.session import Conditions
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.information import decompose
 
@@ -50,13 +49,8 @@ BETWEEN = timedelta(minutes=1)
 
 
 def write_plan(folder, *, between=BETWEEN, growing=False):
-    """A plan of 60 readings with conditions, on a machine with all effects.
-
-    Args:
-        folder: Directory to write.
-        between: Time between two readings.
-        growing: Let the temperature grow with the time; otherwise it goes up and down.
-    """
+    """A plan of 60 readings on a machine with all effects; the temperature grows with the time, or
+    goes up and down."""
     write_robot(folder / "machine", KEYS)
     postures, setups = {}, {}
     rows = ["setup,posture,reading_mm,approach,temperature_C,time"]
@@ -65,11 +59,8 @@ def write_plan(folder, *, between=BETWEEN, growing=False):
             postures[f"{leg}{d:+.0f}"] = {"tcp_mm": [d * (k == leg) for k in "xyz"]}
     for leg in "xyz":
         for direction in sorted(set("xyz") - {leg}):
-            setups[direction + leg] = {
-                "leg": leg,
-                "direction": direction,
-                "section": {"fraction": 0.5},
-            }
+            keys = {"leg": leg, "direction": direction, "section": {"fraction": 0.5}}
+            setups[direction + leg] = keys
     for i, name in enumerate(setups):
         for d in ALONG:
             for letter in "pn":
@@ -104,30 +95,23 @@ class Outcome:
     at_bound: int
     """Backlashes that are estimated as 0."""
 
-    @property
-    def ratio(self):
-        """RMS tool error over the predicted one."""
-        return rms(self.found) / rms(self.predicted)
-
 
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 class EffectMachines:
-    """Machines with all errors of geometry and some effects, and a model of them.
-
-    Args:
-        folder: Directory of the plan (`write_plan`).
-        effects: Effects of the model.
-        temperature: Of all readings and of use, [°C]; by default those of the plan.
-    """
+    """Machines with all errors of geometry and some effects, and a model of them; all readings and
+    the use are at one temperature, [°C], if it is stated."""
 
     def __init__(self, folder, effects, *, temperature=None):
-        self.folder, self.effects, self.temperature = folder / "machine", effects, temperature
+        self.folder, self.effects = folder / "machine", effects
         self.plan = load_plan(folder).with_effects(list(effects))
         if temperature is not None:
-            self.plan = replace(self.plan, readings=tuple(map(self._tempered, self.plan.readings)))
+            readings = self.plan.readings
+            stated = (replace(r.conditions, temperature=temperature) for r in readings)
+            readings = [replace(r, conditions=c) for r, c in zip(readings, stated, strict=True)]
+            self.plan = replace(self.plan, readings=tuple(readings))
         self.problem = build_problem(self.plan, model="full", prior=True, prior_stds=OFFSETS)
         robot = self.plan.robot
         closure = LoopClosure(robot)
@@ -140,12 +124,6 @@ class EffectMachines:
             np.full(len(points), used_at),
         )
         self.workspace = Workspace.even(points)
-
-    def _tempered(self, reading):
-        stated = reading.conditions
-        return replace(
-            reading, conditions=Conditions(stated.approach, self.temperature, stated.time)
-        )
 
     def draw(self, rng, count):
         """Errors and nuisance parameters at their priors, shape (count, n_free), [SI]."""
@@ -224,24 +202,9 @@ class EffectMachines:
         return np.array([measure_deviations(a, self.workspace, points).aligned.rms for a in apart])
 
     def identify(self, truth, rng):
-        """Identify machines from their readings.
-
-        Args:
-            truth: Shape (count, n_free), [SI].
-            rng: Random generator of the noise.
-        """
-        return self.identify_values(truth, self.read(truth, rng), self.machines(truth))
-
-    def identify_values(self, truth, values, machines):
-        """Identify machines from readings, perhaps of machines with other effects.
-
-        Args:
-            truth: Shape (count, n_free), [SI].
-            values: Shape (count, n_entries), [m].
-            machines: The independent machines.
-        """
+        """Identify machines with parameters of shape (count, n_free), [SI], from their readings."""
         problem, n = self.problem, self.problem.n_machine
-        solved = BatchSolver(problem).solve(values, sigma=SIGMA)
+        solved = BatchSolver(problem).solve(self.read(truth, rng), sigma=SIGMA)
         free = problem.machine_selection.names
         sensitivity = ToolSensitivity(self.plan.robot, free=free)(self.commands)
 
@@ -266,7 +229,7 @@ class EffectMachines:
             covered_backlash.extend(np.abs(true - theta)[backlash] < limit * stds[backlash])
             predicted.append(predict(covariance))
         return Outcome(
-            self.tool_errors(machines, solved.theta),
+            self.tool_errors(self.machines(truth), solved.theta),
             np.array(predicted),
             predict(self.covariance(np.zeros(problem.n_free))),
             np.array(covered),

@@ -21,7 +21,6 @@ from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.conditions import UseConditions
-from orthocal.kinematics.error_map import error_map
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.observation.model import predict_readings
@@ -98,22 +97,6 @@ def test_the_tool_is_that_of_the_independent_machine(folder, closure, errors):
         assert np.abs(inverse - drives).max() < 10 * KINEMATICS
 
 
-def test_one_machine_has_a_row_of_placements_for_each_command(closure, errors):
-    map_ = error_map(closure.robot)
-    values = map_.expand(errors)
-    commands = map_.command(points(closure)[0])
-    expected = [map_.placements(values, command) for command in commands]
-    geometry = map_.geometry(values, commands)
-    assert np.array_equal(geometry.placements, expected)
-    assert geometry.drives(commands).shape == (3, 3)
-    several = map_.geometry(np.array([values, 0.0 * values]), commands)
-    assert np.array_equal(several.placements[:3], expected)
-    assert several.drives(commands).shape == (2, 3, 3)
-    chosen = geometry.at(np.array([2, 0]), 3)
-    assert np.array_equal(chosen.placements, [expected[2], expected[0]])
-    assert chosen.drive_errors.shape == (1, map_.drive_errors.size)
-
-
 def test_sensitivities_are_central_differences(plan, errors, closure):
     drives, _ = points(closure)
     names = (*BOWS, "x_slide.offset", "y_slide.rz", "z_slide.y")
@@ -153,9 +136,3 @@ def test_solvers_find_bows_from_exact_readings(plan):
         assert np.abs(found.theta - expected).max() < SAME_OPTIMUM
     batch = BatchSolver(problem).solve(np.tile(problem.values, (2, 1)), sigma=EXACT)
     assert np.abs(batch.theta - expected).max() < SAME_OPTIMUM
-
-
-def test_other_machines_have_no_reference_placements(orthoglide):
-    map_ = error_map(orthoglide)
-    assert map_.in_reference == {}
-    assert len(map_.moved) == len(set(map_.moved))

@@ -71,34 +71,35 @@ def test_the_tool_of_a_machine_agrees_with_the_independent_one(folder):
 
 
 def test_ignored_backlash_costs_what_the_covariance_predicts(folder):
-    study = study_of(folder, ("backlash",), (), machines=16)
+    count = 10
+    study = study_of(folder, ("backlash",), (), machines=count)
     assert study.ignored == ("backlash",)
     table = run_study(study, workers=1)
     s = summarise_accuracy(study, table)
-    assert s.machines == 16
+    assert s.machines == count
     assert abs(s.after - s.predicted.reported.rms) < 3.0 * s.standard_error
     # half the backlash of three drives remains
     remaining = np.sqrt(3.0) * 0.5 * 0.02e-3
     assert s.after > np.hypot(0.95 * s.all_effects, 0.8 * remaining)
-    identified = study_of(folder, ("backlash",), ("backlash",), machines=4)
+    identified = study_of(folder, ("backlash",), ("backlash",), machines=3)
     known = run_study(identified, workers=1)
     assert summarise_accuracy(identified, known).all_effects is None
     same = table.columns["tool_all_effects_um"]
-    assert known.columns["tool_um"] == pytest.approx(same[:4], rel=1e-9)
+    assert known.columns["tool_um"] == pytest.approx(same[:3], rel=1e-9)
     assert s.all_effects == pytest.approx(1e-6 * np.sqrt(np.mean(np.square(same))), rel=1e-9)
     tools = np.array([table.columns[c] for c in ("tool_um", "tool_all_effects_um")]) * 1e-6
-    costs = [-np.subtract(*np.sqrt((np.delete(tools, i, 1) ** 2).mean(1))) for i in range(16)]
-    jackknife = np.std(costs) * np.sqrt(15.0)
-    # two estimates of a standard error; they differ by the order of 1/16, the number of machines
-    assert s.cost_standard_error == pytest.approx(jackknife, rel=0.1)
+    costs = [-np.subtract(*np.sqrt((np.delete(tools, i, 1) ** 2).mean(1))) for i in range(count)]
+    jackknife = np.std(costs) * np.sqrt(count - 1)
+    # two estimates of a standard error; they differ by the order of 1/count
+    assert s.cost_standard_error == pytest.approx(jackknife, rel=1.5 / count)
     document = report_study(table).document
     assert document["ignored"] == ["backlash"]
     assert document["after_all_effects_um"] == pytest.approx(1e6 * s.all_effects)
 
 
-def test_effects_that_change_a_perfect_machine_are_not_predicted(folder):
-    assert study_of(folder, ("thermal",), ()).predicted is None
-    assert study_of(folder, ("drift",), ()).predicted is None
+@pytest.mark.parametrize("effect", ["thermal", "drift"])
+def test_effects_that_change_a_perfect_machine_are_not_predicted(folder, effect):
+    assert study_of(folder, (effect,), ()).predicted is None
 
 
 def test_machines_without_an_effect_can_be_calibrated_with_it(folder):
@@ -111,10 +112,10 @@ def test_machines_without_an_effect_can_be_calibrated_with_it(folder):
 
 
 def test_a_worker_has_the_effects_of_the_study(folder):
-    study = study_of(folder, ("backlash", "screw"), ("screw",))
+    study = study_of(folder, ("backlash",), ())
     copy = pickle.loads(pickle.dumps(study))
     assert copy == study
-    assert copy.session.robot.effect_names == ("screw",)
+    assert copy.session.robot.effect_names == ()
     assert run_task(copy, 0) == run_task(study, 0)
 
 
@@ -136,7 +137,7 @@ def test_unknown_effects_and_missing_conditions_are_refused(folder):
 
 
 def test_the_command_prints_the_cost_of_ignoring_an_effect(folder, root):
-    words = ["study", "accuracy", folder, "--effects", "backlash", "--machines", 12]
+    words = ["study", "accuracy", folder, "--effects", "backlash", "--machines", 8]
     code, out, _ = run_orthocal(root, *words, "--ignore", "backlash", "--workers", 1)
     assert code == 0
     answer = " ".join(out.split())

@@ -38,10 +38,8 @@ def test_a_bound_holds_a_parameter_and_changes_the_others(session):
     assert list(fit.solution.at_bound) == [1, 0, 0]
     assert fit.solution.theta[0] == pytest.approx(0.9e-3, abs=1e-8)
     linear = linearise_problem(build_problem(session, model="offsets"))
-    low = np.array([-1e-3, -np.inf, -np.inf]) / 5e-3
-    high = np.array([0.9e-3, np.inf, np.inf]) / 5e-3
-    bounds = (low, high)
-    expected = lsq_linear(linear.jacobian, linear.residual, bounds=bounds, tol=1e-15).x * 5e-3
+    scaled = [[low / 5e-3, *[end] * 2] for low, end in ((-1e-3, -np.inf), (0.9e-3, np.inf))]
+    expected = lsq_linear(linear.jacobian, linear.residual, bounds=scaled, tol=1e-15).x * 5e-3
     assert np.abs(fit.solution.theta - expected).max() < LINEAR
     assert fit.linearised_theta == pytest.approx(expected, abs=1e-9)
 
@@ -56,15 +54,6 @@ def test_a_parameter_at_its_bound_acts_like_a_known_value(session):
     for name in ("y_slide.offset", "z_slide.offset"):
         assert bounded[name].value == pytest.approx(known[name].value, abs=1e-8)
         assert bounded[name].std == pytest.approx(known[name].std, rel=1e-3)
-
-
-def test_bounds_that_do_not_bind_change_nothing(session):
-    free = identified(session)
-    bounded = identified(session, Choice(bounds={"*.offset_m": (-5e-3, 5e-3)}))
-    for a, b in zip(free.free, bounded.free, strict=True):
-        assert a.value == pytest.approx(b.value, abs=SAME_OPTIMUM)
-        assert a.std == pytest.approx(b.std, rel=1e-6)
-        assert b.at_bound is None
 
 
 def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):
@@ -127,37 +116,23 @@ def test_readings_without_deviation_are_explained(exact_plan):
     still = calibrate(simulate_session(exact_plan, {}, exact=True).session, **UNJUDGED)
     (found,) = still.assessment.of_kind("no deviation")
     assert found.numbers["before_rms_mm"] == pytest.approx(0.0, abs=1e-9)
-    assert not calibrate(plan_with_truth(exact_plan), **UNJUDGED).assessment.of_kind("no deviation")
 
 
-def plan_with_truth(exact_plan):
-    return simulate_session(exact_plan, TRUTH, seed=0).session
-
-
-def test_parameters_without_sensitivity_are_explained(exact_plan):
+def test_parameters_without_sensitivity_are_explained(session):
     """The platform's own placement is seen by no reading of leg x alone."""
-    result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]), **UNJUDGED)
+    result = calibrate(session, Choice(free=["frame.tcp.*"]), **UNJUDGED)
     (found,) = result.assessment.of_kind("no sensitivity")
+    assert not result.assessment.of_kind("no deviation")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
     assert "effects of all free parameters on the readings are below the noise" in found.text
     assert set(result.identifiability.below_noise) == {p.name for p in result.free}
 
 
-def test_iterations_and_times_are_recorded(session):
-    result = identified(session, solver="ipopt")
-    assert result.solver.status == "Solve_Succeeded"
-    assert result.solver.iterations >= 1
-    assert result.solver.seconds_build > 0.0
-    assert result.solver.seconds_solve > 0.0
-
-
 def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
     """Without tolerance no two estimates agree, so that all rounds end without convergence."""
-    from orthocal.estimation import fit
-
-    assert identified(session, "full").solver.noise_converged
-    monkeypatch.setattr(fit, "SIGMA_TOLERANCE", 0.0)
-    result = calibrate(session, "full", **UNJUDGED)
+    assert identified(session, "lengths").solver.noise_converged
+    monkeypatch.setattr("orthocal.estimation.fit.SIGMA_TOLERANCE", 0.0)
+    result = calibrate(session, "lengths", **UNJUDGED)
     assert not result.solver.noise_converged
     (finding,) = result.assessment.of_kind("no convergence")
     assert finding.severity == "note"

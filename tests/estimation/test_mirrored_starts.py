@@ -107,6 +107,15 @@ def test_a_height_over_the_circle_of_the_tool_is_mirrored(robot, height):
     assert mirrored_names(problem) == ["setup.a.centre_z"]
 
 
+def solve(problem, **options):
+    """Calls of descents while variable projection solves a problem."""
+    program = VariableProjection(problem, options=SolverOptions(**options))
+    descend = VariableProjection._descend
+    with patch.object(VariableProjection, "_descend", autospec=True, side_effect=descend) as spy:
+        program.solve(sigma=SIGMA)
+    return spy.call_args_list
+
+
 @pytest.mark.parametrize(
     ("height", "planes"),
     [(0.02, ((0, 1),)), (0.0, ((0, 1), (1, 2)))],
@@ -115,22 +124,13 @@ def test_a_height_over_the_circle_of_the_tool_is_mirrored(robot, height):
 def test_a_ball_in_general_position_has_one_start(height, planes):
     problem = problem_of(circles(entered("orthoglide"), {"a": bar_at(height)}, planes=planes))
     assert len(problem.mirrored) == 0
-    with patch.object(
-        VariableProjection, "_descend", autospec=True, side_effect=VariableProjection._descend
-    ) as descend:
-        VariableProjection(problem).solve(sigma=SIGMA)
-    assert descend.call_count == 1
+    assert len(solve(problem)) == 1
 
 
 def test_the_largest_number_of_iterations_applies_to_mirror_images():
-    problem = problem_of(circles(entered("biglide"), {"a": bar_at(0.0)}))
-    program = VariableProjection(problem, options=SolverOptions(max_iterations=25))
-    with patch.object(
-        VariableProjection, "_descend", autospec=True, side_effect=VariableProjection._descend
-    ) as descend:
-        program.solve(sigma=SIGMA)
-    assert descend.call_count > 1
-    assert {call.args[3] for call in descend.call_args_list} == {25}
+    calls = solve(problem_of(circles(entered("biglide"), {"a": bar_at(0.0)})), max_iterations=25)
+    assert len(calls) > 1
+    assert {call.args[3] for call in calls} == {25}
 
 
 def test_a_shared_ball_is_mirrored_once():

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from derivatives import assert_jacobian
 from tolerances import KINEMATICS
 
 from orthocal import load_plan, load_session
@@ -34,12 +35,7 @@ def test_the_implicit_jacobian_is_the_derivative(plan, free, size):
     scale, rng = problem.theta_scale, np.random.default_rng(1)
     theta = size * rng.normal(size=problem.n_free) * scale
     _, jacobian = problem.predict_and_jacobian(theta)
-    steps = 1e-3 * np.diag(scale)  # a thousandth of a tolerance
-    ahead, behind = np.split(problem.predict(np.vstack([theta + steps, theta - steps])), 2)
-    numeric = (ahead - behind).T / 2e-3
-    assert np.isfinite(jacobian).all()
-    largest = max(1e-3, np.abs(numeric).max())
-    assert np.abs(jacobian - numeric).max() < 1e-6 * largest  # third order
+    assert_jacobian(problem, theta, jacobian, least=1e-3)
 
 
 def test_known_values_are_held(plan):

@@ -193,7 +193,7 @@ def draw_sessions(plan, count, seed):
 def test_readings_scatter_about_their_predictions_as_stated():
     plan, scores = plan_of("workshop"), []
     models = {count: LinearModel(part(plan, count)) for count in (6, 12, 18)}
-    for session in draw_sessions(plan, 30, 5):
+    for session in draw_sessions(plan, 20, 5):
         for count, model in models.items():
             values = session.values[:count]
             mean, std = model.predict_row(values, count - 1)

@@ -227,10 +227,11 @@ def test_errors_of_silent_rows_are_amounts_without_prior(cycles):
 @pytest.mark.parametrize("kind", ["outlier", "displaced gauge"])
 def test_the_evidence_of_an_amount_does_not_depend_on_the_order_of_the_gauges(cycles, kind):
     found = []
-    rows = [i for i, r in enumerate(cycles.readings) if r.setup == "xz"]
-    values = cycles.values
+    few = cycles.select([r for r in cycles.readings if r.cycle <= 2])
+    rows = [i for i, r in enumerate(few.readings) if r.setup == "xz"]
+    values = few.values
     values[rows[4] if kind == "outlier" else rows[4:]] += 0.1e-3
-    for session in both_orders(cycles, 2e-6, 0.1e-3):
+    for session in both_orders(few, 2e-6, 0.1e-3):
         (anomaly,) = find_anomalies(session.with_values(values)).found
         assert anomaly.explanation.kind == kind
         if kind == "displaced gauge":
@@ -240,11 +241,10 @@ def test_the_evidence_of_an_amount_does_not_depend_on_the_order_of_the_gauges(cy
 
 
 NAMED = [
-    *("sign of two setups", "sign of a posture, all cycles", "legs exchanged"),
-    *("step missed in the middle", "dial stuck for 3", "two slips"),
+    *("sign of two setups", "sign of a posture, all cycles", "two slips"),
     "step missed, all later setups",
 ]
-"""Mistakes of all kinds that two cycles show clearly."""
+"""Mistakes that two cycles show clearly; other tests have those of other kinds."""
 
 
 @pytest.mark.slow
@@ -373,3 +373,4 @@ def test_similar_hypotheses_that_are_clear_together_are_reported(seed, name):
     made = {n: m for n, _, m in make_mistakes(session, seed, sizes=())}[name]
     (anomaly,) = find_anomalies(session.with_values(made.values)).found
     assert anomaly.log_evidence < CLEAR_LOG_BAYES
+    assert any(is_named(e, made) for e in (anomaly.explanation, *anomaly.alternatives))

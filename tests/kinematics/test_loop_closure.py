@@ -6,15 +6,18 @@ from dataclasses import replace
 
 import closed_form
 import numpy as np
+import pinocchio as pin
 import pytest
 from linkages import joint, make_robot
 from tolerances import CLOSED, CLOSED_FORM
 
+from orthocal import load_robot
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics import continuation
 from orthocal.kinematics.loop_closure import LoopClosure, find_beyond_travel, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.measurement.files.coordinate_tables import drive_columns
+from orthocal.robot.model import closure_row_units
 
 LENGTH = 0.31025
 
@@ -32,12 +35,12 @@ def reachable_points(count, seed=1):
 
 
 def test_closed_loops_equal_the_closed_forms_on_many_points(orthoglide):
-    points = reachable_points(3000)
+    points = reachable_points(1000)
     joints = closed_form.inverse(points, length=LENGTH)
     closure = LoopClosure(orthoglide)
     assert np.abs(closure.forward(joints) - points).max() < CLOSED_FORM
     assert np.abs(closed_form.direct(joints, length=LENGTH) - points).max() < CLOSED_FORM
-    assert np.abs(closure.inverse(points[:1000]) - joints[:1000]).max() < CLOSED_FORM
+    assert np.abs(closure.inverse(points[:200]) - joints[:200]).max() < CLOSED_FORM
 
 
 def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
@@ -67,17 +70,7 @@ def test_batches_equal_the_newton_iteration_of_pinocchio(orthoglide):
         assert np.abs(ours - theirs).max() < CLOSED
 
 
-def test_closures_hold_at_the_solution(orthoglide):
-    joints = closed_form.inverse(reachable_points(50, seed=6), length=LENGTH)
-    for d, p in zip(joints, LoopClosure(orthoglide).close(joints), strict=True):
-        residual, jacobian = orthoglide.evaluate_constraints(d, p)
-        assert np.abs(residual).max() < CLOSED
-        assert np.linalg.matrix_rank(jacobian[:, orthoglide.passive_index]) == 18
-
-
 def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
-    from orthocal.robot.model import closure_row_units
-
     passive = orthoglide.reference_passive
     _, jacobian = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)
     scaled = jacobian[:, orthoglide.passive_index] * closure_row_units(orthoglide)[:, None]
@@ -85,23 +78,11 @@ def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
     assert 1 / 30 < values[-1] / values[0] < 1 / 10
 
 
-def test_a_robot_with_redundant_closure_rows_closes(fivebar):
-    """Gepetto's three keys only: a planar loop with all six rows, three of them dependent."""
-    assert fivebar.closure_rows == 6
-    motors = np.array([[0.0, 0.0], [0.2, -0.1], [-0.4, 0.3]])
-    passive = nominal_closure(fivebar).close(motors)
-    for d, p in zip(motors, passive, strict=True):
-        residual, _ = fivebar.evaluate_constraints(d, p)
-        assert np.abs(residual).max() < CLOSED
-
-
 @pytest.mark.parametrize(
     "motors", [(0.2, -0.1), (0.174, 1.74), (-0.434, 1.561), (1.253, 1.651), (-1.091, 0.493)]
 )
 def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
     """The apex stays on its side of the elbows; plain Newton from zero turns all but the first."""
-    import pinocchio as pin
-
     first = -0.1 + (-0.05 + 0.08j) * np.exp(1j * motors[0])
     second = 0.1 + (0.05 + 0.08j) * np.exp(1j * motors[1])
     between = second - first
@@ -113,14 +94,6 @@ def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
     pin.framesForwardKinematics(fivebar.model, data, q)
     reached = data.oMf[fivebar.frame_id("end_a")].translation
     assert np.abs(reached - [apex.real, apex.imag, 0.0]).max() < CLOSED_FORM
-
-
-def test_another_robot_goes_the_same_way(biglide):
-    points = np.random.default_rng(8).uniform(-0.05, 0.05, (100, 2))
-    joints = np.sqrt(0.2**2 - points[:, ::-1] ** 2) + points
-    closure = nominal_closure(biglide)
-    assert np.abs(closure.inverse(points) - joints).max() < CLOSED_FORM
-    assert np.abs(closure.forward(joints)[:, :2] - points).max() < CLOSED_FORM
 
 
 def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
@@ -214,8 +187,6 @@ def test_underdriven_loops_are_singular(root, tmp_path):
     (folder / "loose.yaml").write_text(
         "closed_loop: [[end_a, end_b]]\ntype: ['3d']\nname_mot: [motor_a, motor_b]\n"
     )
-    from orthocal import load_robot
-
     with pytest.raises(ClosureError, match="leave 1 of 3 passive motions free"):
         LoopClosure(load_robot(folder)).close([0.1, 0.1])
 

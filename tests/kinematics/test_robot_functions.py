@@ -9,7 +9,6 @@ from conftest import load_afresh
 from symbolic_robot import SymbolicRobot
 from tolerances import KINEMATICS
 
-from orthocal.kinematics.error_map import SymbolicErrorMap
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
 
@@ -80,62 +79,6 @@ def test_derivatives_equal_those_of_the_expressions(request, name, size):
     found.append(by_errors(p_t, p_a))
     for ours, wanted in zip(found, expected, strict=True):
         assert np.abs(ours - wanted).max() < KINEMATICS
-
-
-@pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
-def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, name):
-    """Sums and scales too: what a program of CasADi is given, and what NumPy computes with."""
-    robot = request.getfixturevalue(name)
-    functions, rng = robot_functions(robot), np.random.default_rng(3)
-    errors = functions.errors
-    free = robot.parameters.names[::2]
-    columns = errors.unit_errors(free) * rng.uniform(0.5, 2.0, len(free))
-    fixed = 1e-3 * rng.normal(size=len(errors.names))
-    chosen = SymbolicErrorMap(errors, fixed=fixed, unit_errors=columns)
-    theta = 1e-2 * rng.normal(size=len(free))
-    at = fixed + columns @ theta
-    slopes = errors.placement_jacobian(at, columns)
-    _, d, q = _draw(robot, 0.0)
-    neutral = errors.command(robot.drive_zero)[None, len(robot.drives) :]
-    at_theta = ca.Function("values", [], chosen.values(ca.MX(ca.DM(theta)), neutral))
-    values = [np.asarray(v.full()).reshape(-1) for v in at_theta.call([])]
-    arranged = ca.Function("placements", list(chosen.symbols), [chosen.placements])
-    placements = np.asarray(arranged(*values).full()).reshape(-1)
-    assert np.abs(placements - errors.placements(at)).max() < KINEMATICS
-
-    drives = ca.SX.sym("drives", len(robot.drives))
-    passive = ca.SX.sym("passive", robot.passive_index.size)
-    _, g_a, _, g_t = functions.closure_expressions(
-        chosen.actuated(drives), passive, chosen.placements
-    )
-    function = ca.Function(
-        "chain",
-        [drives, passive, *chosen.symbols],
-        [chosen.actuated(drives), ca.densify(chosen.chain(g_t, g_a, drives))],
-    )
-    actuated, by_theta = (np.asarray(v.full()) for v in function(d, q, *values))
-    assert np.abs(actuated[:, 0] - errors.geometry(at).drives(d)).max() < KINEMATICS
-    _, g_a, _, g_t = _derivatives(
-        functions, errors.geometry(at).drives(d)[None], q[None], placements
-    )
-    _, by_drive_errors = errors.geometry(at).drive_derivatives(d)
-    expected = g_t @ slopes + g_a @ by_drive_errors @ columns[errors.drive_errors]
-    assert np.abs(by_theta - expected).max() < KINEMATICS
-
-
-@pytest.mark.parametrize("name", ["orthoglide", "biglide"])
-def test_placements_are_those_that_pinocchio_is_given(request, name):
-    robot = request.getfixturevalue(name)
-    errors = robot_functions(robot).errors
-    values = dict(zip(errors.names, _draw(robot, 0.05)[0], strict=True))
-    values = {n: v for n, v in values.items() if not n.endswith((".offset", ".scale"))}
-    machine = robot.with_errors(values)
-    found = errors.placements(errors.expand(values)).reshape(-1, 12)
-    for moved, placement in zip(errors.moved, found, strict=True):
-        if not moved.of_frame:
-            expected = machine.model.jointPlacements[moved.index]
-            assert np.abs(placement[:9].reshape(3, 3).T - expected.rotation).max() < KINEMATICS
-            assert np.abs(placement[9:] - expected.translation).max() < KINEMATICS
 
 
 def test_robots_share_functions_only_where_they_are_the_same(orthoglide):

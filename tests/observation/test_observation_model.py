@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import plan_of, session_of
+from derivatives import assert_jacobian
 from gauges import exact
 from tool_coordinate import ToolCoordinate
 
-from orthocal import load_plan, load_session
+from orthocal import load_plan
 from orthocal.estimation.problem import build_problem
 from orthocal.observation.model import predict_readings
 from orthocal.sensors import registry
@@ -70,21 +72,20 @@ def move_station(plan):
 
 
 @pytest.fixture(params=["sweep", "workshop", "tool", "several sensors"])
-def problem(request, root, tmp_path):
+def problem(request, tmp_path):
     """Lines, balls aligned by eye, sensors at the tool, and three kinds with different noise."""
     if request.param == "sweep":
-        yield build_problem(exact(load_session(root / "examples/sweep")), model="full")
+        yield build_problem(exact(session_of("sweep")), model="full")
     elif request.param == "workshop":
-        yield build_problem(load_plan(root / "examples/workshop/plan.yaml"), model="full")
+        yield build_problem(plan_of("workshop"), model="full")
     elif request.param == "tool":
         (tmp_path / "plan.yaml").write_text(TOOL_SENSORS)
         yield build_problem(move_station(load_plan(tmp_path / "plan.yaml")), model="full")
     else:
         registry.register_sensor(ToolCoordinate)
         (tmp_path / "plan.yaml").write_text(SEVERAL_SENSORS)
-        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full").with_noise_ratio(
-            np.random.default_rng(0).uniform(0.5, 2.0, 20)
-        )
+        ratio = np.random.default_rng(0).uniform(0.5, 2.0, 20)
+        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full").with_noise_ratio(ratio)
         registry.unregister_sensor(ToolCoordinate.kind)
 
 
@@ -128,12 +129,7 @@ def test_simulation_and_problem_predict_the_same_readings(problem):
 def test_the_jacobian_is_that_of_central_differences(problem):
     theta, _, passive, _ = draw(problem, count=1)
     reading, jacobian = problem.predict_and_jacobian(theta, passive)
-    steps = 1e-3 * np.diag(problem.theta_scale)  # a thousandth of a tolerance
-    ahead, behind = np.split(problem.predict(np.vstack([theta + steps, theta - steps])), 2)
-    numeric = (ahead - behind).T / 2e-3
-    assert np.isfinite(jacobian).all()
-    largest = max(1e-3, np.abs(numeric).max())
-    assert np.abs(jacobian[0] - numeric).max() < 1e-6 * largest  # third order
+    assert_jacobian(problem, theta[0], jacobian[0], least=1e-3)
     si_reading, si = problem.predict_and_jacobian(theta, passive, units="SI")
     assert np.array_equal(si_reading, reading)
     assert np.allclose(si * problem.theta_scale, jacobian, rtol=1e-14, atol=0.0)
@@ -148,10 +144,14 @@ def test_opening_and_follow_close_the_loops_to_first_order(problem):
         assert left < 100.0 * size**2
         predicted = linear.reading + linear.opening - problem.predict(theta, passive)
         assert np.abs(predicted).max() < 100.0 * size**2
+    change = 1e-4 * rng.normal(size=theta.shape)
+    follow = problem.linearise(theta, passive).follow(change)[0]
+    closed = problem.close(theta[0] + change[0] * problem.theta_scale)
+    assert np.abs(passive[0] + follow - closed).max() < 1e-9
 
 
-def test_a_machine_out_of_reach_spoils_no_other(root):
-    problem = build_problem(exact(load_session(root / "examples/sweep")), model="offsets")
+def test_a_machine_out_of_reach_spoils_no_other():
+    problem = build_problem(exact(session_of("sweep")), model="offsets")
     theta = np.array([[1e-3, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 1e-3]])
     readings, passive, reached = problem.simulate(theta)
     assert reached.tolist() == [True, False, True]

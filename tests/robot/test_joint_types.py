@@ -102,25 +102,20 @@ def test_a_closed_robot_with_them_is_pinocchios_in_casadi_too(tmp_path, kind):
     [
         (
             declared("j7", "SPHERICAL"),
-            "joint_name: the URDF has no moving joint 'j7'; did you mean",
+            "joint_name: the URDF has no moving joint 'j7'; did you",
         ),
         (declared("plate", "FIXED"), "joint_name: the URDF has no moving joint 'plate'"),
         (declared("j1", "BALL"), "joint_type of 'j1': found 'BALL'; expected FIXED, SPHERICAL, UJ"),
         (declared("j1, j2", "FIXED"), "joint_type has 1 entries; joint_name has 2"),
         (declared("j1, j1", "FIXED, FIXED"), "joint_name names a joint twice"),
-        (
-            declared("j0", "SPHERICAL"),
-            "joint_name: 'j0' is a motor",
-        ),
+        (declared("j0", "SPHERICAL"), "joint_name: 'j0' is a motor"),
         (declared("j2", "SPHERICAL"), "joint_name: 'j2' needs the name 'j2_Y', which the URDF has"),
     ],
 )
 def test_declarations_that_do_not_fit_are_refused(tmp_path, yaml, message):
-    joints = (
-        chain(ARM) + joint("plate", "j2", (0, 0, 0), "") + joint("j2_Y", "plate", (0, 0, 0), "")
-    )
+    fixed = joint("plate", "j2", (0, 0, 0), "") + joint("j2_Y", "plate", (0, 0, 0), "")
     with pytest.raises(RobotError, match=message) as caught:
-        make_robot(tmp_path / "arm", joints, yaml)
+        make_robot(tmp_path / "arm", chain(ARM) + fixed, yaml)
     assert caught.value.where.startswith(f"{tmp_path}/arm/arm.yaml")
 
 

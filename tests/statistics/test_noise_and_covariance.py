@@ -55,17 +55,14 @@ def observations(setup, posture, zero):
 def test_covariance_of_a_line_solved_by_hand():
     """y = a u + zero at u = −1, 0, 2: the slope has variance σ²/Σ(u − ū)² = σ²/(14/3)."""
     o = observations([0, 0, 0], [0, 1, 2], [0, 0, 0])
-    information = decompose(np.array([[-1.0], [0.0], [2.0]]), o)
-    assert information.posterior(sigma=0.3, precision=np.zeros(1)).covariance[
-        0, 0
-    ] == pytest.approx(0.3**2 / (14 / 3), rel=KINEMATICS)
+    information, square = decompose(np.array([[-1.0], [0.0], [2.0]]), o), 14 / 3
+    free, weighed = (information.posterior(sigma=0.3, precision=np.array([p])) for p in (0.0, 1.0))
+    assert free.covariance[0, 0] == pytest.approx(0.3**2 / square, rel=KINEMATICS)
     # with a prior of one: precisions add
-    assert information.posterior(sigma=0.3, precision=np.ones(1)).covariance[0, 0] == pytest.approx(
-        1.0 / (1.0 + (14 / 3) / 0.3**2), rel=KINEMATICS
-    )
-    assert information.posterior(
-        sigma=0.3, precision=np.ones(1)
-    ).effective_parameters == pytest.approx((14 / 3) / (14 / 3 + 0.3**2), rel=KINEMATICS)
+    expected = 1.0 / (1.0 + square / 0.3**2)
+    assert weighed.covariance[0, 0] == pytest.approx(expected, rel=KINEMATICS)
+    share = square / (square + 0.3**2)
+    assert weighed.effective_parameters == pytest.approx(share, rel=KINEMATICS)
 
 
 def test_dependent_columns_reduce_the_rank():
@@ -238,7 +235,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations():
     sigma = 20e-6
     problem = build_problem(exact(plan_of("raw-cycles")), model="full", prior=True)
     rng = np.random.default_rng(0)
-    truths = rng.normal(size=(200, problem.n_free))
+    truths = rng.normal(size=(120, problem.n_free))
     entries, _, reached = problem.simulate(truths * problem.theta_scale)
     assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
@@ -259,9 +256,10 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations():
     n = len(z)
     assert np.abs(z.mean(axis=0)).max() < 4.5 / np.sqrt(n)
     assert np.abs(np.mean(z**2, axis=0) - 1.0).max() < 4.5 * np.sqrt(2.0 / n)
-    # upper edge of Marchenko and Pastur for a sample covariance of white noise
+    # upper edge of Marchenko and Pastur for a sample covariance of white noise; beyond it by 0.2
+    # once in a hundred cases (Tracy and Widom)
     largest = np.linalg.eigvalsh(z.T @ z / n).max()
-    assert largest < (1.0 + np.sqrt(z.shape[1] / n)) ** 2 + 0.15
+    assert largest < (1.0 + np.sqrt(z.shape[1] / n)) ** 2 + 0.2
     assert_coverage(z)
 
 
@@ -295,14 +293,6 @@ def test_chance_of_equal_readings():
     assert chance_of_equal_readings(0, 9, sigma=5e-6, step=1e-5) == 1.0
     many = chance_of_equal_readings(700, 2000, sigma=5e-6, step=1e-5)
     assert many == pytest.approx(stats.binom.sf(699, 2000, single))
-
-
-def test_the_chance_of_an_excess_over_cycles_is_an_f_test():
-    """Residuals of 12 degrees, 5 of them the cycles' own; or χ² of a given σ."""
-    chi_square = 5 + 7 * 4.0  # beside the cycles' own 5: F(7, 5) at 4.0, χ² of 12 at 33
-    expected = stats.f.sf(4.0, 7, 5)
-    assert chance_of_excess(chi_square, 12, cycles_dof=5.0) == pytest.approx(expected)
-    assert chance_of_excess(chi_square, 12) == pytest.approx(stats.chi2.sf(chi_square, 12))
 
 
 @pytest.mark.parametrize(

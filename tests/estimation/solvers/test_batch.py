@@ -15,7 +15,7 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 
 SIGMA = 10e-6
-SETS = 12
+SETS = 8
 SHOWN = 4
 """Sets that are solved alone too."""
 

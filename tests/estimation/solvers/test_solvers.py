@@ -15,9 +15,6 @@ from orthocal.calibration.file import calibration_json
 from orthocal.errors import ClosureError, OrthocalError, SolverError
 from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
-    SIX_ROWS,
-    invert_equation_8,
-    leg_parallelism_matrix,
     linearise_problem,
 )
 from orthocal.estimation.loss import Loss
@@ -72,6 +69,8 @@ def test_two_solvers_find_one_optimum(loss, example, model, choice):
     assert (ours.at_bound == ipopts.at_bound).all()
     if choice == "bounds":
         assert ours.at_bound.any()
+    # on the straight part of Huber's loss steps by Gauss and Newton do not converge
+    assert ipopts.hessian == ("exact" if loss == "huber" else "gauss-newton")
 
 
 @pytest.mark.parametrize(
@@ -106,20 +105,6 @@ def test_a_machine_with_offsets_of_a_centimetre_has_one_optimum(root):
     offsets = [batch.theta[0, problem.free.index(f"{axis}_slide.offset")] for axis in "xyz"]
     assert offsets == pytest.approx(FAR_OFFSETS, abs=1e-7)
     assert batch.objective[0] < problem.observations.size
-
-
-def test_linearised_offsets_of_the_paper_are_those_of_equation_8():
-    """Residuals and offsets of Experiment 2 by the matrix of the paper."""
-    session = exact(session_of("table1/experiment-2"))
-    problem = build_problem(session, model="offsets")
-    matrix = leg_parallelism_matrix(
-        length=0.31025, displacement_max=0.06, displacement_min=-0.1, rows=6
-    )
-    rows = {(r.setup, r.posture): r.value for r in session.readings}
-    assert len(rows) == 6
-    differences = [rows[name, f"{name[1]}_max"] for name in SIX_ROWS]
-    offsets = invert_equation_8(matrix) @ differences
-    assert LinearisedProgram(problem).solve(sigma=1e-5).theta == pytest.approx(offsets, abs=1e-8)
 
 
 def test_the_linearised_solver_minimises_a_robust_loss():
@@ -163,6 +148,8 @@ def test_a_calibration_states_its_solver(tmp_path):
         path.write_text(calibration_json(result))
         assert load_calibration(path).solver.name == kind
     complete, projected, linearised = found.values()
+    assert complete.solver.status == "Solve_Succeeded"
+    assert min(complete.solver.iterations, complete.solver.seconds_solve) > 0
     assert projected.model_covariance == pytest.approx(complete.model_covariance, rel=1e-6)
     for p, q, r in zip(complete.free, projected.free, linearised.free, strict=True):
         assert q.value == pytest.approx(p.value, abs=1e-11)
