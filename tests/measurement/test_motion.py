@@ -174,6 +174,19 @@ def test_commented_joints_reach_the_coordinates_by_pinocchio(small, motions):
     assert shown_joints(robot, robot.drive_zero + 0.01) == pytest.approx([0.01, -0.005, 0.24])
 
 
+def test_every_drive_approaches_from_the_same_side(small, motions):
+    """Each drive coordinate grows monotonically by the approach length."""
+    robot = small.robot
+    for motion in motions:
+        points, _ = read_program(write_program(small, motion), robot)
+        assert {s.approach for s in motion.stops} == {"ppp"}
+        for before, after in zip(points[0::2], points[1::2], strict=True):
+            shares = np.linspace(0.0, 1.0, 9)[:, None]
+            drives = nominal_closure(robot).inverse((before + shares * (after - before)) * MM)
+            assert np.all(np.diff(drives, axis=0) > 0.0)
+            assert drives[-1] - drives[0] == pytest.approx([USUAL_LENGTH] * 3, abs=3e-7)
+
+
 def test_approach_from_the_other_side_at_the_end_of_travel(small):
     lower = replace(small.robot.drives[0], lower=0.2)
     robot = replace(small.robot, drives=(lower, *small.robot.drives[1:]))
