@@ -542,3 +542,21 @@ def test_a_default_workspace_out_of_reach_is_refused_by_the_option(tmp_path, wit
     assert "yaml" not in err
     box = "--workspace-mm=-40:40,-40:40,0:11"
     assert orthocal("new", tmp_path / "delta", *short, box).returncode == 0
+
+
+def test_a_posture_beyond_the_travel_is_named_with_the_controllers_number(copied):
+    file = copied / "first/session.yaml"
+    text = file.read_text()
+    assert "y_max:\n    tcp_mm: [0.0, 60.0, 0.0]" in text
+    file.write_text(text.replace("tcp_mm: [0.0, 60.0, 0.0]", "joints_mm: [250.0, 330.0, 250.0]"))
+    code, _, err = orthocal("check", copied / "first")
+    assert code == 2
+    assert "y_slide would be at -80.000 mm; it reaches from -70 to 150 mm" in err
+
+
+def test_a_directory_with_files_of_two_robots_is_refused(copied):
+    renamed = copied.rename(copied.with_name("lathe"))
+    (renamed / "other.urdf").write_bytes((renamed / "mill.urdf").read_bytes())
+    code, _, err = orthocal("check", renamed / "first")
+    assert code == 2
+    assert "one URDF file, or one named lathe.urdf; found mill.urdf, other.urdf" in err

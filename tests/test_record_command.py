@@ -958,3 +958,12 @@ def test_a_probe_has_no_rule_for_its_approach(tmp_path, run):
         folder.mkdir()
         (folder / "session.yaml").write_text(text + setups)
         assert ("Approach every posture" in run(folder)[1]) == stated
+
+
+@pytest.mark.usefixtures("unjudged")
+def test_a_setup_that_continues_keeps_its_temperature(folder, run):
+    with_effects(folder, "thermal")
+    run(folder, "19", "0.01")
+    _, out, _ = run(folder, "", "0.02")
+    assert "Enter keeps 19 °C" in out
+    assert [r["temperature_C"] for r in rows_of(folder)][:2] == ["19", "19"]

@@ -535,7 +535,8 @@ def _choose_entries(
     """
     if joint is None:
         return (find_entries(calibration) if wrongly else ()), []
-    unchanged = all(one.firmware == calibration.session.firmware for one in new)
+    settings = calibration.session.firmware
+    unchanged = settings is not None and all(settings.equals(one.firmware) for one in new)
     assessment, findings = assessment_of(joint), _find_further_change(joint, unchanged=unchanged)
     entries = assessment.entries if findings else find_entries(calibration)
     return entries, [*findings, *assessment.of_kind(*ENTRY_KINDS)]

@@ -92,6 +92,16 @@ class DeltaSettings(FileRecord):
         """Heights of the nozzle at the endstops (Klipper: position_endstop), shape (3,), [m]."""
         return np.array(self.homed) - self.middle
 
+    def equals(self, other: DeltaSettings | None) -> bool:
+        """True for the same firmware and numbers, but for their rounding."""
+        if other is None or self.firmware != other.firmware:
+            return False
+        ours, theirs = (
+            np.array([s.radius, *s.rods, *s.homed, *s.angles, *s.tilts, *s.probe, *s.shift])
+            for s in (self, other)
+        )
+        return float(np.abs(ours - theirs).max()) <= EQUAL
+
     def moved(self, change: Array) -> DeltaSettings:
         """Same settings with coordinates of the carriages that differ by `change`, (3,), [m]."""
         homed, shift = triple(change + self.homed), triple(change + self.shift)

@@ -28,6 +28,7 @@ from orthocal import (
 from orthocal.calibration.identify import identify
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.estimation.problem import build_problem
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.observation.simulate import collect_errors, load_errors, truth_document
 from orthocal.robot.loading import packaged_robots
 from orthocal.statistics.zeros import project_out_zeros
@@ -324,3 +325,16 @@ def test_feet_follow_the_dimensions(plan):
     side = keys["z_side_foot_y"]
     assert abs(side["at_mm"][0] - side["pivot_mm"][0]) == 80
     assert plan.robot.parameters.stated == TOLERANCES
+
+
+def test_the_tool_after_an_adjustment_is_that_by_pinocchio(robot):
+    amounts = {"far": 0.3e-3, "tilted": -0.2e-3}
+    values = {f"{n}.adjustment": v for n, v in amounts.items()}
+    drives = robot.drive_zero + np.array([0.02, -0.03, 0.01])
+    tool = LoopClosure(robot, fixed=values).forward(drives)
+    shimmed = replace(robot, model=shim(robot, amounts))
+    rebuilt = shimmed.displaced({})
+    by_shims = frames(rebuilt, drives)[robot.tcp.frame]
+    unmoved = LoopClosure(robot).forward(drives)
+    assert np.linalg.norm(tool - by_shims) < 2e-3 * np.linalg.norm(tool - unmoved)
+    assert np.linalg.norm(tool - unmoved) > 2e-5

@@ -128,3 +128,32 @@ def test_closure_residual_equals_pinocchios_constraint_error(request, robot):
             lambda u, d=d, e=errors: np.asarray(function(d, u, e)[0]).ravel(), p
         )
         assert np.abs(slope - numeric).max() < DERIVATIVE
+
+
+def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):
+    """d pose / d placement twist at zero error, as a twist in the frame's own axes."""
+    model = orthoglide.model
+    joints = list(model.names)[1:]
+    frame = orthoglide.frame_id("tcp")
+    q, dj = ca.SX.sym("q", model.nv), ca.SX.sym("dj", 6, len(joints))
+    twists = {Placement(model.getJointId(n), False): dj[:, i] for i, n in enumerate(joints)}
+    tree = SymbolicTree(model, q, joint_placements=erroneous_placements(model, twists)[0])
+    pose = tree.frame_pose(frame)
+    stacked = ca.vertcat(ca.vec(pose.rotation), pose.position)
+    slope = ca.Function("slope", [q, dj], [ca.jacobian(stacked, ca.vec(dj))])
+    v = np.random.default_rng(5).uniform(-1.0, 1.0, model.nv)
+    ours = np.asarray(slope(v, np.zeros((6, len(joints)))).full())
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, orthoglide.configuration(v))
+    theirs = pin.computeFrameKinematicRegressor(model, data, frame, pin.ReferenceFrame.LOCAL)
+    rotation = data.oMf[frame].rotation
+    linear = rotation.T @ ours[9:]
+    turned = ours[:9].reshape(3, 3, -1, order="F")
+    angular = np.stack(
+        [
+            [s[2, 1], s[0, 2], s[1, 0]]
+            for s in (rotation.T @ turned[:, :, i] for i in range(turned.shape[2]))
+        ],
+        axis=1,
+    )
+    assert np.abs(np.vstack([linear, angular]) - theirs).max() < KINEMATICS

@@ -599,3 +599,20 @@ def test_small_differences_are_shown_with_all_their_decimals(fivebar, monkeypatc
     pair = (drive, JointTrim(1.0e-3 * DEG), JointTrim(1.1e-3 * DEG))
     text = entered_lines.compare_joints([pair])
     assert text == "JOINT_0 has BACKLASH 0.0011000 deg instead of BACKLASH 0.0010000 deg"
+
+
+def test_latching_is_positive_by_default_and_said_to_be(folder, one, plain):
+    home = ["--home-offset", "352.5,340,-3.25"]
+    default = export(folder, one, "default", *home)
+    assert "Assumed: HOME_LATCH_VEL of all joints is positive. " in default.stderr
+    lines = [v for v in plain.read_text().splitlines() if not v.startswith("HOME_LATCH_VEL")]
+    (folder / "unlatched.ini").write_text("\n".join(lines))
+    by_file = export(folder, one, "unlatched", "--ini", folder / "unlatched.ini")
+    assert "unlatched.ini does not state it" in by_file.stderr
+    assert "--ini" not in by_file.stderr
+    stated = export(folder, one, "stated", *home, "--latched", "+,+,+")
+    assert "Assumed" not in stated.stderr
+    texts = [(folder / name / "joints.ini").read_text() for name in ("default", "stated")]
+    entered = [re.findall(r"^HOME_OFFSET = (\S+)", text, re.M) for text in texts]
+    assert entered[0] == entered[1]
+    assert len(entered[0]) == 3

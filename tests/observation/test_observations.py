@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from derivatives import central_differences
 from machines import reading_by_pinocchio
-from tolerances import KINEMATICS, THREE_DECIMALS_MM
+from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 
 from orthocal import load_plan, load_session
 from orthocal.observation.contacts import locate_contacts
@@ -124,3 +124,13 @@ def test_contacts_move_along_the_leg_with_the_posture(raw_cycles):
     assert contact.problems == ["", "", ""]
     assert (contact.along == leg.axis).all()
     assert contact.direction.tolist() == [0.0, 1.0, 0.0]
+
+
+def test_equation_7_comes_out_of_the_urdf(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    rows = [r for r in plan.readings if r.setup == "yx" and r.cycle == 1]
+    plan = replace(plan, readings=tuple(rows))
+    slope = central_differences(lambda d: differences(plan, d), np.zeros(3), step=1e-6)
+    zero, x_max, x_min = slope
+    assert np.abs((x_max - zero) - [0.13668, 0.19339, 0.0]).max() < PRINTED
+    assert np.abs((x_min - zero) - [-0.06050, -0.32232, 0.0]).max() < PRINTED

@@ -216,3 +216,9 @@ def test_errors_are_drawn_with_the_tolerances_given(orthoglide):
     for name, value in own.items():
         factor = 0.4 if name.endswith(".offset") else 1.0
         assert other[name] == pytest.approx(factor * value)
+
+
+def test_a_simulated_session_states_that_it_is_simulated(plan):
+    session = simulate_session(plan, ERRORS, seed=5).session
+    assert session.title.startswith("Simulated: ")
+    assert "Simulated by orthocal, not measured (seed 5)" in session.source

@@ -13,6 +13,7 @@ from calibrated import UNJUDGED, calibrated, session_of
 from conftest import marked_plots
 from machines import write_orthoglide
 from rich.console import Group
+from scipy.stats import t as student
 
 from orthocal import Choice, calibrate, load_plan, simulate_session, summarize
 from orthocal.assessment.controller_entries import expanded_uncertainty
@@ -30,6 +31,7 @@ from orthocal.output.text.answer import (
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import render_result
 from orthocal.output.text.tables import RECOMMENDING
+from orthocal.statistics.chance import coverage_factor
 
 MOST_LINES = 40
 
@@ -280,3 +282,14 @@ def test_the_next_session_is_named_after_the_last_one(answers, session, new):
     assert next_session(named, saved) == Path(new)
     unknown = replace(calibration, session=replace(record, path=None))
     assert next_session(unknown, saved) == Path("mill/first-calibration-again")
+
+
+def test_few_contrasts_widen_the_scaled_errors(answers):
+    """Six differences and three offsets: Student's factor, 3.18 of three contrasts, for the scaled
+    tolerances."""
+    calibration = answers["table1/experiment-2"]
+    factor = coverage_factor(calibration.tolerance_scale.contrasts)
+    assert factor == pytest.approx(student.ppf(0.975, calibration.tolerance_scale.contrasts))
+    for e in calibration.assessment.entries:
+        expected = np.sqrt(4.0 * (e.std**2 - e.std_scaled**2) + factor**2 * e.std_scaled**2)
+        assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-9)

@@ -307,3 +307,9 @@ def test_an_invalid_dial_is_refused(tmp_path, text, message):
     code, _, err = run_orthocal(".", "plan", "orthoglide", "--gauge", dial)
     assert code == 2
     assert message in err
+
+
+def test_the_controller_is_stated_once(tmp_path):
+    words = ["--backlash", "0", "--ini", tmp_path / "machine.ini"]
+    code, _, err = run_orthocal(".", "plan", "orthoglide", *words)
+    assert (code, err) == (2, "orthocal: --backlash: found with --ini; expected one\n")

@@ -819,3 +819,42 @@ def test_sensors_on_a_planar_machine(owned):
     assert list(setups) == ["track[x]", "track[y]", "track[z]"]
     assert {len(p.values) for p in postures.values()} == {2}
     assert len(postures) == 25
+
+
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_a_sensor_with_too_short_a_range_is_named(owned):
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
+    short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
+    with few_balls(1), uncompared(), few_machines():
+        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
+    assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
+    assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
+    title, *_, last = summarize(plan).split("\n\n")
+    assert title.endswith("min, without bar")
+    remedy = (
+        "To plan with it, state smaller tolerances (centre_tolerance_mm and length_tolerance_mm)"
+    )
+    entering = "or enter offsets of other readings first and plan from their session."
+    assert " ".join(last.split()).startswith("Not in the plan: bar. Within the tolerances")
+    assert " ".join(last.split()).endswith(f"{remedy}, use a gauge of more range {entering}")
+    active = plan.session.with_controller([1e-3, 0.0, 0.0])  # offsets are entered already
+    (words,) = describe_absent(replace(plan, complements_session=True, session=active))
+    assert words.endswith(f"{remedy} or use a gauge of more range.")
+
+
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_a_sensor_that_gains_less_than_others_is_named(owned):
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    noisy = owned(bar=BAR.replace("sigma_mm: 0.002", "sigma_mm: 1"))
+    with few_balls(1), uncompared(), few_machines():
+        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=noisy, **FEW), starts=1)
+    assert plan.unchosen == {"bar": 0.0}
+    title, *_, last = summarize(plan).split("\n\n")
+    assert title.endswith("min, without bar")
+    better = (
+        "Not in the plan: bar. In this time other readings reduce the expected tool error more."
+    )
+    assert " ".join(last.split()) == better
+    (words,) = describe_absent(replace(plan, unchosen={"bar": 6e-3}))
+    assert words.startswith(f"{better} Within the tolerances of machine, place and gauge many of ")
+    assert "±6.0 mm, beyond its range" in words

@@ -288,3 +288,13 @@ def test_the_rods_of_a_delta_reach_its_default_workspace(tmp_path, rod, radius):
     delta = LinearDelta(rod=rod, radius=radius, travel=(0.005, 0.56))
     robot = written(tmp_path, delta)
     assert describe_unreachable_box(robot, robot.workspace) == ""
+
+
+@pytest.mark.parametrize("machine", [LinearDelta(), InclinedOrthoglide(), Biglide(), SINGLE])
+def test_the_tool_is_where_pinocchio_closes_the_loops(tmp_path, machine):
+    robot = written(tmp_path, machine)
+    count = len(machine.coordinates)
+    drives = LoopClosure(robot).inverse(POINTS[:, :count])
+    for point, coordinates in zip(POINTS, drives, strict=True):
+        at = np.where(np.arange(3) < count, point, 0.0)
+        assert np.abs(place(robot, coordinates, "tcp") - at).max() < CLOSED

@@ -162,3 +162,25 @@ def test_a_description_without_a_place_for_a_size_is_named(tmp_path):
     described.write_text(text.replace("y_slide: {zero_mm: 250}", "y_slide: {}"))
     with pytest.raises(RobotError, match=r"mine\.yaml: has no line 'y_slide:"):
         remake_robot(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"leg": 250.0}, "legs of 250000 mm; expected 20 to 5000 mm"),
+        ({"leg": 0.4}, "does not include 400 mm, the leg length"),
+        (
+            {"travel": (0.12, 0.65)},
+            "travel from 120 to 650 mm; legs of 310.25 mm reach 31.025 to 589.475",
+        ),
+        ({"attachment": -0.01}, "hinges -10 mm from the tool centre point; expected 0"),
+        ({"rods_apart": 0.01}, "rods of radius 5.5 mm, 10 mm apart; expected them to clear"),
+        ({"rod_radius": 0.0}, "rods of radius 0 mm"),
+        ({"leg": float("nan")}, "legs of nan mm"),
+    ],
+)
+def test_sizes_that_make_no_machine_are_refused(tmp_path, change, message):
+    with pytest.raises(RobotError, match="dimensions") as e:
+        make_robot(Orthoglide(**change), tmp_path / "mine")
+    assert message in str(e.value)
+    assert not (tmp_path / "mine").exists()

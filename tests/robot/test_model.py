@@ -6,6 +6,7 @@ import shutil
 
 import linkages
 import numpy as np
+import pinocchio as pin
 import pytest
 from derivatives import assert_derivative
 from tolerances import KINEMATICS
@@ -153,3 +154,28 @@ def test_a_folder_of_another_name_is_another_robot(root, tmp_path, monkeypatch):
             shutil.copy(root / f"tests/robots/biglide/biglide{suffix}", folder)
         monkeypatch.chdir(folder)
         assert load_robot(".").name == name
+
+
+def test_joint_axes_and_origins_are_those_of_the_design(orthoglide):
+    """Leg frame: X from slider to tool; Z = e_z, e_x, e_y; the joints of the URDF."""
+    r, w, a, length = orthoglide, 0.08, 0.04, 0.31025
+    leg_x = {"x": [-1, 0, 0], "y": [0, -1, 0], "z": [0, 0, -1]}
+    leg_z = {"x": [0, 0, 1], "y": [1, 0, 0], "z": [0, 1, 0]}
+    expected = {
+        "swivel": ([-a, 0, 0], [0, 0, 1]),
+        "bar_a": ([0, 0, w / 2], [0, 1, 0]),
+        "bar_b": ([0, 0, -w / 2], [0, 1, 0]),
+        "coupler": ([length, 0, 0], [0, 1, 0]),
+        "wrist": ([0, 0, -w / 2], [0, 0, 1]),
+        "fork": ([0, 0, 0], [0, 1, 0]),
+    }
+    for k in "xyz":
+        slide = r.model.jointPlacements[r.model.getJointId(f"{k}_slide")]
+        x, z = np.array(leg_x[k]), np.array(leg_z[k])
+        assert np.abs(slide.rotation - np.column_stack([x, np.cross(z, x), z])).max() < KINEMATICS
+        for joint, (origin, axis) in expected.items():
+            i = r.model.getJointId(f"{k}_{joint}")
+            assert np.abs(r.model.jointPlacements[i].translation - origin).max() < KINEMATICS
+            data = r.model.joints[i].createData()
+            r.model.joints[i].calc(data, pin.neutral(r.model))
+            assert np.array_equal(data.S.ravel()[3:], axis)

@@ -177,3 +177,10 @@ def test_an_open_posture_says_mm_and_mrad(orthoglide):
     far = np.array([0.9, 0.3, 0.3])
     with pytest.raises(ClosureError, match=r"open by \S+ mm( and \S+ mrad)?, \d+% of the way"):
         LoopClosure(orthoglide).close(far)
+
+
+def test_a_found_zero_is_where_pinocchio_says(tmp_path):
+    """The loop closure solver starts from the posture that Pinocchio's models closed."""
+    robot = load_robot(write_wide_linkage(tmp_path / "wide"))
+    passive = LoopClosure(robot).close(robot.drive_zero)
+    assert np.abs(passive - robot.reference_passive).max() < KINEMATICS

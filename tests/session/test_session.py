@@ -11,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tolerances import CLOSED_FORM, KINEMATICS
 
-from orthocal import Gauge, Section, Tip, load_session, plan_readings, write_session
+from orthocal import (
+    Gauge,
+    Section,
+    Tip,
+    calibrate,
+    load_plan,
+    load_session,
+    plan_readings,
+    write_session,
+)
 from orthocal.effects.compensation import JointTrim
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import build_problem
@@ -195,3 +204,16 @@ def test_unknown_arguments_are_refused(raw_cycles):
         problem.predict_and_jacobian(np.zeros(2))
     with pytest.raises(ParameterError, match="criterion: found 'zzz'; expected one of aligned"):
         plan_readings(raw_cycles.robot, criterion="zzz")
+
+
+def test_semicolons_and_a_byte_order_mark_are_read(tmp_path):
+    rows = "\ufeffsetup;posture;reading_mm\nyx;zero;0.1\n\nyx;x_max;0.2\n"
+    session = load_session(write(tmp_path / "s", rows=rows))
+    assert np.allclose(session.values, [0.1e-3, 0.2e-3])
+
+
+def test_a_plan_is_not_calibrated(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    assert np.isnan(plan.values).all()
+    with pytest.raises(SessionError, match="54 of 54 readings have no value"):
+        calibrate(plan, "offsets")

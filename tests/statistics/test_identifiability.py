@@ -235,3 +235,10 @@ def test_readings_that_determine_nuisance_parameters_check_nothing():
     # no reading of this session is repeated
     assert calibration.redundancy == pytest.approx(o.size - np.trace(hat), rel=1e-9)
     assert calibration.redundancy < fit.independent_readings - problem.n_machine - 1.0
+
+
+def test_the_position_of_the_swivel_along_its_slide_is_an_offset(raw_cycles):
+    choice = Choice(free=["*.offset", "x_swivel.x"], prior=True)
+    result, _ = identify(raw_cycles, choice, **QUICK)
+    words = [c.words for c in result.identifiability.alike]
+    assert words == ["x_slide.offset and x_swivel.x: only their difference"]

@@ -15,6 +15,9 @@ from orthocal.calibration.file import calibration_json
 from orthocal.errors import ClosureError, OrthocalError, SolverError
 from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
+    SIX_ROWS,
+    invert_equation_8,
+    leg_parallelism_matrix,
     linearise_problem,
 )
 from orthocal.estimation.loss import Loss
@@ -277,3 +280,17 @@ def test_a_posture_that_no_step_reaches_is_named():
     task = LineTask([1.0], abs, farthest=0.5)  # shorter steps are possible, but worse
     with pytest.raises(SolverError, match="no step improves the fit"):
         task.descend()
+
+
+def test_linearised_offsets_of_the_paper_are_those_of_equation_8():
+    """Residuals and offsets of Experiment 2 by the matrix of the paper."""
+    session = exact(session_of("table1/experiment-2"))
+    problem = build_problem(session, model="offsets")
+    matrix = leg_parallelism_matrix(
+        length=0.31025, displacement_max=0.06, displacement_min=-0.1, rows=6
+    )
+    rows = {(r.setup, r.posture): r.value for r in session.readings}
+    assert len(rows) == 6
+    differences = [rows[name, f"{name[1]}_max"] for name in SIX_ROWS]
+    offsets = invert_equation_8(matrix) @ differences
+    assert LinearisedProgram(problem).solve(sigma=1e-5).theta == pytest.approx(offsets, abs=1e-8)
