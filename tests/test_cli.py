@@ -87,6 +87,7 @@ def test_view_writes_pages_of_calibrations_sessions_and_robots(
     options = "--posture x_max --exaggerate 1 --show all".split()
     for subject, words, *expected in (
         (calibrated / "calibration.json", options, "Machine, calibrated", "true scale"),
+        (calibrated, [], "Machine, calibrated"),
         (experiment, [], "Machine, nominal"),
         (root / "tests/sessions/lines/plan.yaml", [], "none measured yet"),
         (root / "tests/robots/fivebar", [], "Mechanical zero", "motor_a"),

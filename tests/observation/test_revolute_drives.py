@@ -9,7 +9,7 @@ from linkages import joint, write_robot, write_wide_linkage
 from scipy.stats import binom, norm
 from tolerances import KINEMATICS, TRUTH_BACK
 
-from orthocal import load_plan, write_session
+from orthocal import load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.predictive import expect_deviations, judge_deviations
 from orthocal.assessment.validation import validate_calibration
@@ -104,6 +104,19 @@ def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot):
         assert abs(other.errors[name] - value) < TRUTH_BACK
     changes = [e.best_change for e in find_entries(other)]
     assert np.abs(np.array(changes) - (np.array([*OFFSETS.values()]) - ACTIVE)).max() < TRUTH_BACK
+
+
+def test_offsets_survive_a_round_trip(tmp_path, robot):
+    plan = load_plan(write_plan(tmp_path / "plan", robot, controllers()["deg"]))
+    session = simulate_session(plan, OFFSETS, exact=True).session
+    path = write_session(session, tmp_path / "copy", decimals=12)
+    again = load_session(path)
+    assert "offsets_mrad" in path.read_text()
+    assert np.abs(again.active_offsets - ACTIVE).max() < KINEMATICS
+    drives = [
+        np.abs(again.postures[n].drives - p.drives).max() for n, p in session.postures.items()
+    ]
+    assert max(drives) < KINEMATICS
 
 
 def test_what_was_identified_is_validated(tmp_path, robot):

@@ -597,6 +597,17 @@ def test_candidates_of_points_are_three_readings_in_postures_over_the_workspace(
     assert np.ptp(points, axis=0).min() > 0.15  # most of the reach along each axis
 
 
+def test_points_are_read_from_both_sides_on_a_machine_with_backlash(owned, orthoglide):
+    both, any_side = (
+        list_tool_candidates(with_effects(orthoglide, [effect]), owned(track=TRACKER), None)[3]
+        for effect in ("backlash", "drift")
+    )
+    assert {r.conditions for r in any_side} == {None}
+    found = [{(r.setup, r.posture) for r in both if r.approach == a} for a in ("ppp", "nnn")]
+    assert found == [{(r.setup, r.posture) for r in any_side}] * 2
+    assert len(both) == 2 * len(any_side)
+
+
 def test_a_plan_of_points_is_one_setup_within_its_time(tracked):
     session = tracked.session
     assert list(session.setups) == ["track[x]", "track[y]", "track[z]"]
