@@ -235,7 +235,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations():
     sigma = 20e-6
     problem = build_problem(exact(plan_of("raw-cycles")), model="full", prior=True)
     rng = np.random.default_rng(0)
-    truths = rng.normal(size=(120, problem.n_free))
+    truths = rng.normal(size=(200, problem.n_free))
     entries, _, reached = problem.simulate(truths * problem.theta_scale)
     assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
@@ -256,10 +256,9 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations():
     n = len(z)
     assert np.abs(z.mean(axis=0)).max() < 4.5 / np.sqrt(n)
     assert np.abs(np.mean(z**2, axis=0) - 1.0).max() < 4.5 * np.sqrt(2.0 / n)
-    # upper edge of Marchenko and Pastur for a sample covariance of white noise; beyond it by 0.2
-    # once in a hundred cases (Tracy and Widom)
+    # upper edge of Marchenko and Pastur for a sample covariance of white noise
     largest = np.linalg.eigvalsh(z.T @ z / n).max()
-    assert largest < (1.0 + np.sqrt(z.shape[1] / n)) ** 2 + 0.2
+    assert largest < (1.0 + np.sqrt(z.shape[1] / n)) ** 2 + 0.15
     assert_coverage(z)
 
 
@@ -293,6 +292,14 @@ def test_chance_of_equal_readings():
     assert chance_of_equal_readings(0, 9, sigma=5e-6, step=1e-5) == 1.0
     many = chance_of_equal_readings(700, 2000, sigma=5e-6, step=1e-5)
     assert many == pytest.approx(stats.binom.sf(699, 2000, single))
+
+
+def test_the_chance_of_an_excess_over_cycles_is_an_f_test():
+    """Residuals of 12 degrees, 5 of them the cycles' own; or χ² of a given σ."""
+    chi_square = 5 + 7 * 4.0  # beside the cycles' own 5: F(7, 5) at 4.0, χ² of 12 at 33
+    expected = stats.f.sf(4.0, 7, 5)
+    assert chance_of_excess(chi_square, 12, cycles_dof=5.0) == pytest.approx(expected)
+    assert chance_of_excess(chi_square, 12) == pytest.approx(stats.chi2.sf(chi_square, 12))
 
 
 @pytest.mark.parametrize(

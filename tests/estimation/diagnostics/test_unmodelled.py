@@ -87,13 +87,16 @@ def test_offsets_of_machines_with_all_errors_have_the_predicted_covariance(resul
     assert spread.max() < (1 + edge) ** 2 + 0.1
 
 
-def test_a_machine_has_all_errors_of_its_parts(orthoglide):
+def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
     """21 placements and offsets, three scales, both ends of what its loops join, but idle ones."""
     names = machine_errors(orthoglide)
     assert names == orthoglide.parameters.select_model("full")
     owners = {n.rsplit(".", 1)[0] for n in names if n.startswith("frame.")}
     rods = {f"frame.{k}_{end}" for k in "xyz" for end in ("crossbar_end", "rod_b_tip")}
     assert owners == rods | {"frame.y_foot_end", "frame.z_foot_end"}
+    # the tool is the end of rod x, and the only frame whose error is the length of this rod
+    tool = [n for n in machine_errors(biglide) if n.startswith("frame.x_tip")]
+    assert tool == ["frame.x_tip.x", "frame.x_tip.z"]
 
 
 def test_the_full_model_has_no_unmodelled_errors(exact_plan):
