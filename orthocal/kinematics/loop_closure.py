@@ -33,8 +33,8 @@ from orthocal.robot.model import Robot, require_commanded_tool, require_tcp
 FORCE_CACHE_SIZE = 32
 """Sets of postures whose rod forces are cached for one robot."""
 
-SOLUTION_CACHE_SIZE, MAX_CACHED_POSTURES = 16, 200
-"""Sets of postures whose solutions from the reference posture are cached, and postures per set."""
+SOLUTION_CACHE_SIZE, MAX_CACHED_POSTURES = 32, 200
+"""Sets of postures whose solutions are cached, and postures per set."""
 
 MAX_ITERATIONS = 10
 CONDITION_TOLERANCE = 1e-9
@@ -132,9 +132,10 @@ class LoopClosure:
             )
             return passive if batch else passive[0]
 
-        from_reference = start is None and failures is None and not allow_free
-        if from_reference and values.ndim == 1 and len(d) <= MAX_CACHED_POSTURES:
-            passive = self._solutions.find((values.tobytes(), d.tobytes()), solve)
+        is_one_machine = values.ndim == 1 and (start is None or np.ndim(start) <= 2)
+        if is_one_machine and len(d) <= MAX_CACHED_POSTURES and failures is None and not allow_free:
+            begin = None if start is None else np.asarray(start).tobytes()
+            passive = self._solutions.find((values.tobytes(), d.tobytes(), begin), solve)
         else:
             passive = solve()
         return passive[..., 0, :] if single else passive
@@ -459,7 +460,7 @@ class LoopClosure:
 
 @cached_per_robot
 def _solutions(robot: Robot) -> ArrayCache:
-    """Solutions of a robot from the reference posture, which all models of a session need."""
+    """Solutions of a robot's closures, which several models and figures of a session need."""
     return ArrayCache(SOLUTION_CACHE_SIZE)
 
 

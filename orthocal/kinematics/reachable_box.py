@@ -11,7 +11,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError, RobotError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.function_cache import cached_per_robot
+from orthocal.kinematics.function_cache import cached_per_robot, fingerprint, function_key
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
@@ -25,6 +25,7 @@ from orthocal.kinematics.workspace import (
     tool_at_zero,
 )
 from orthocal.robot.model import Robot, coordinate_units, require_commanded_tool
+from orthocal.runtime import disk_cache
 
 RequireReach = Callable[[Array], object]
 """Check of tool positions, shape (K, n_coordinates), [m]: raises ClosureError if one is out of
@@ -81,13 +82,21 @@ def find_workspace(robot: Robot, require_reach: RequireReach | None = None) -> W
 
 @cached_per_robot
 def _default_workspace(robot: Robot) -> Workspace:
-    """Largest cube of at most ±60 mm that the nominal machine reaches with a margin."""
+    """Largest cube of at most ±60 mm that the nominal machine reaches with a margin.
+
+    Its limits are cached on disk.
+    """
+    cube = cube_limits(robot)
+    key = function_key("default workspace", fingerprint(robot))
+    content = disk_cache.load(key)
+    if content is not None:
+        return box_workspace(robot, np.frombuffer(content).reshape(cube.shape))
     zero, require_reach = tool_at_zero(robot), _nominal_reach_check(robot)
-    return _largest_box(
-        robot,
-        cube_limits(robot),
-        lambda points: require_reach(zero + REACH_MARGIN * (points - zero)),
+    workspace = _largest_box(
+        robot, cube, lambda points: require_reach(zero + REACH_MARGIN * (points - zero))
     )
+    disk_cache.store(key, workspace.limits.tobytes())
+    return workspace
 
 
 def describe_unreachable_box(robot: Robot, box: Array) -> str:
