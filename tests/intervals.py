@@ -1,4 +1,4 @@
-"""Coverage of 95 % intervals, counted on independent ones: those along principal axes."""
+"""Coverage of 95 % intervals, counted on independent ones."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ DETERMINED = 0.5
 """Variance over that of the prior below which a direction is determined by the readings."""
 
 
-def principal_scores(error, covariance):
-    """Independent standardised errors along the principal axes of a predicted covariance.
+def independent_scores(error, covariance):
+    """Independent standardised errors by a predicted covariance Σ, in prior standard deviations.
 
-    With the mask of the axes that the readings determine; all in prior standard deviations.
+    All of them, Σ^(-1/2) e with the symmetric root, and those along the principal axes that the
+    readings determine. The other axes are arbitrary: the variance along each of them is 1.
     """
     variances, axes = np.linalg.eigh(covariance)
-    return axes.T @ error / np.sqrt(variances), variances < DETERMINED
+    along = axes.T @ error / np.sqrt(variances)
+    return axes @ along, along[variances < DETERMINED]
 
 
 def recorded_scores(calibration, errors):
-    """`principal_scores` of a calibration record; errors by their names, [SI]."""
+    """`independent_scores` of a calibration record; errors by their names, [SI]."""
     chosen = [p for p in calibration.parameters if p.name in errors]
     at = [calibration.parameters.index(p) for p in chosen]
     scale = np.array([p.prior_std for p in chosen])
     apart = np.array([p.value - errors[p.name] for p in chosen])
     covariance = calibration.total_covariance[np.ix_(at, at)] / np.outer(scale, scale)
-    return principal_scores(apart / scale, covariance)
+    return independent_scores(apart / scale, covariance)
 
 
 def coverage_band(count):

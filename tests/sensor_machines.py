@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from bounds import bound_um, posterior_covariance
-from intervals import assert_coverage, principal_scores
+from intervals import assert_coverage, independent_scores
 
 from orthocal.assessment.tool_error import measure_deviations, measure_uncertainty
 from orthocal.estimation.problem import build_problem
@@ -36,11 +36,11 @@ class Outcome:
     bound: float
     """That of the linear Bayesian estimate about the nominal machine."""
     scores: np.ndarray
-    """Standardised errors of the machines along the principal axes, shape (count, n). Together with
-    the mounting they are curved: along the thinnest axes of a probe's 40 machines the linearised
-    covariance of all parameters is exceeded 2.3 times, with errors of a tenth 1.05 times."""
+    """Standardised errors of the machines' parameters. Together with the mounting they are curved:
+    along the thinnest axes of a probe's 40 machines the linearised covariance of all parameters is
+    exceeded 2.3 times, with errors of a tenth 1.05 times."""
     determined: np.ndarray
-    """Mask of the axes that the readings determine, shape (count, n)."""
+    """Those along the principal axes that the readings determine."""
 
 
 def calibrate_machines(plan, space, *, count=MACHINES, offset_std=0.5e-3, read=None):
@@ -70,7 +70,7 @@ def calibrate_machines(plan, space, *, count=MACHINES, offset_std=0.5e-3, read=N
     for true, theta, jacobian in zip(truth, found.theta, jacobians, strict=True):
         posterior = posterior_covariance(plan, problem, jacobian)
         inner = posterior[:n, :n]
-        scores.append(principal_scores((theta - true)[:n] / scale[:n], inner))
+        scores.append(independent_scores((theta - true)[:n] / scale[:n], inner))
         if len(predicted) < MACHINES:
             covariance = inner * np.outer(scale[:n], scale[:n])
             sizes = measure_uncertainty(tool, covariance, space, space.points).sizes
@@ -79,8 +79,8 @@ def calibrate_machines(plan, space, *, count=MACHINES, offset_std=0.5e-3, read=N
         float(np.sqrt(np.mean(np.square(errors)))),
         float(np.sqrt(np.mean(np.square(predicted)))),
         1e-6 * bound_um(plan, space, offset_std=offset_std),
-        np.array([s for s, _ in scores]),
-        np.array([d for _, d in scores]),
+        np.concatenate([s for s, _ in scores]),
+        np.concatenate([d for _, d in scores]),
     )
 
 
@@ -88,5 +88,5 @@ def assert_promises(outcome):
     """Compare tool errors and intervals with what calibrations promise."""
     assert 0.75 * outcome.predicted < outcome.achieved < WITHIN * outcome.predicted
     assert outcome.achieved < WITHIN * outcome.bound
-    assert_coverage(outcome.scores, fewest=FEWEST)
-    assert_coverage(outcome.scores[outcome.determined], fewest=FEWEST)
+    assert_coverage([outcome.scores], fewest=FEWEST)
+    assert_coverage([outcome.determined], fewest=FEWEST)

@@ -73,4 +73,4 @@ def test_tool_errors_and_intervals_are_as_predicted(name, offset_std, count, lar
     outcome = calibrate_machines(plan, space, count=count, offset_std=offset_std, read=read)
     assert 0.75 * outcome.predicted < outcome.achieved < WITHIN * outcome.predicted
     assert outcome.achieved < largest
-    assert_coverage(outcome.scores)
+    assert_coverage([outcome.scores])

@@ -54,7 +54,7 @@ def report(name, outcome):
     kept = found < WITHIN * predicted and found < BESIDE_BOUND * outcome.bound
     for kind, covered in (
         ("all directions", outcome.covered),
-        ("determined by the readings", outcome.covered[outcome.determined]),
+        ("determined by the readings", outcome.covered_determined),
     ):
         inside, n = int(covered.sum()), covered.size
         low, high = coverage_band(n)

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from effect_plans import write_robot
 from independent import Expansion, Gauge, IndependentMachine, States
-from intervals import principal_scores
+from intervals import independent_scores
 
 from orthocal import load_plan
 from orthocal.assessment.tool_error import measure_deviations, measure_uncertainty
@@ -88,10 +88,10 @@ class Outcome:
     """That of the linear Bayesian estimate from these readings, about the nominal machine."""
     covered: np.ndarray
     """Whether independent 95 % intervals contain the truth, of all errors but the backlashes."""
-    determined: np.ndarray
-    """Whether these intervals are those of what the readings determine."""
+    covered_determined: np.ndarray
+    """The same of those along the principal axes that the readings determine."""
     covered_backlash: np.ndarray
-    """The same of the interval of each backlash by itself."""
+    """Whether the interval of each backlash by itself contains the truth."""
     at_bound: int
     """Backlashes that are estimated as 0."""
 
@@ -216,15 +216,15 @@ class EffectMachines:
 
         of_backlash = np.array([name.endswith(".backlash") for name in free])
         others, backlash = np.flatnonzero(~of_backlash), np.flatnonzero(of_backlash)
-        limit, covered, determined = confidence_factor(np.inf), [], []
+        limit, covered, covered_determined = confidence_factor(np.inf), [], []
         covered_backlash, predicted = [], []
         for true, theta, at_bound in zip(truth, solved.theta, solved.at_bound, strict=True):
             covariance = self.covariance(theta, at_bound)
             scale = problem.theta_scale[others]
             inner = covariance[np.ix_(others, others)] / np.outer(scale, scale)
-            scores, known = principal_scores((theta - true)[others] / scale, inner)
+            scores, along = independent_scores((theta - true)[others] / scale, inner)
             covered.extend(np.abs(scores) < limit)
-            determined.extend(known)
+            covered_determined.extend(np.abs(along) < limit)
             stds = np.sqrt(np.diag(covariance))
             covered_backlash.extend(np.abs(true - theta)[backlash] < limit * stds[backlash])
             predicted.append(predict(covariance))
@@ -233,7 +233,7 @@ class EffectMachines:
             np.array(predicted),
             predict(self.covariance(np.zeros(problem.n_free))),
             np.array(covered),
-            np.array(determined),
+            np.array(covered_determined),
             np.array(covered_backlash),
             int((solved.at_bound[:, :n][:, of_backlash] == -1).sum()),
         )

@@ -33,7 +33,7 @@ TOOL = 1.3
 
 
 def check(outcome):
-    for covered in (outcome.covered, outcome.covered[outcome.determined]):
+    for covered in (outcome.covered, outcome.covered_determined):
         low, high = coverage_band(covered.size)
         assert low <= covered.sum() <= high
     assert rms(outcome.found) < TOOL * rms(outcome.predicted)
