@@ -18,9 +18,9 @@ from orthocal.io.fields import read_only
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import find_below_bed, tool_at_zero
+from orthocal.kinematics.workspace import find_below_bed, grid_points, tool_at_zero
 from orthocal.measurement.files.session_keys import GaugeKeys
-from orthocal.measurement.motion.approach import approach_steps, usual_approaches
+from orthocal.measurement.motion.approach import USUAL_LENGTH, approach_steps, usual_approaches
 from orthocal.observation.conditions import (
     MINUTES_PER_READING,
     MINUTES_PER_SETUP,
@@ -43,8 +43,8 @@ DEFAULT_REACH = 0.1
 REACH_MARGIN = 0.005
 """Distance of postures from the end of the reach, which offsets of the machine reduce, [m]."""
 
-AXIS_ROOM = 0.002
-"""Distance of postures from soft limits of an axis, for approaches from either side, [m]."""
+ROOM_POINTS = 5
+"""Positions along each side of the box at which the motion of the tool in an approach is found."""
 
 BOX_STEP = 0.01
 """Step of the limits of the box, [m]."""
@@ -141,8 +141,10 @@ class Equipment:
         coordinates = require_tcp(robot).coordinates
         low, high = np.array([axes[c] for c in coordinates]).T
         box = choose_box(robot, self.box)
+        box = np.column_stack([np.maximum(box[:, 0], low), np.minimum(box[:, 1], high)])
+        room = _approach_room(robot, box)
         box = np.column_stack(
-            [np.maximum(box[:, 0], low + AXIS_ROOM), np.minimum(box[:, 1], high - AXIS_ROOM)]
+            [np.maximum(box[:, 0], low + room), np.minimum(box[:, 1], high - room)]
         )
         for c, (first, last) in zip(coordinates, box.tolist(), strict=True):
             if first > last:
@@ -258,6 +260,30 @@ def choose_box(robot: Robot, requested: Array | None) -> Array:
     beyond = ranges[:, 0] > ranges[:, 1]  # nothing is reachable: no postures will result
     ranges[beyond] = requested[beyond]
     return read_only(ranges)
+
+
+def _approach_room(robot: Robot, box: Array) -> Array:
+    """Largest motion of the tool in an approach within a box, in whole millimetres.
+
+    All drives move from the same side, each by its usual length. Along the path of a sensor the
+    tool moves by the usual length.
+
+    Args:
+        robot: The robot.
+        box: Limits of the tool's coordinates, shape (n_coordinates, 2), [m].
+
+    Returns:
+        Shape (n_coordinates,), [m].
+    """
+    points = grid_points(*(np.linspace(low, high, ROOM_POINTS) for low, high in box.tolist()))
+    drives, reached = _reach_points(robot, points)
+    coordinates, closure = list(require_tcp(robot).coordinates), nominal_closure(robot)
+    room = np.full(len(box), USUAL_LENGTH)
+    for side in "pn":
+        begin = drives[reached] - approach_steps(robot, side * len(robot.drives))
+        tool = closure.forward(begin, failures=Failures())[:, coordinates]
+        room = np.fmax(room, np.nanmax(np.abs(tool - points[reached]), axis=0, initial=0.0))
+    return np.asarray(np.ceil(room / MM - 1e-6) * MM)
 
 
 def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:

@@ -12,11 +12,13 @@ from commands import run_orthocal
 from plan_searches import calibrate_drawn
 from uncompared import uncompared
 
-from orthocal import load_plan, simulate_session, write_session
+from orthocal import load_plan, load_robot, simulate_session, write_session
 from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError
-from orthocal.measurement.motion.approach import can_approach, describe_approach
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.workspace import grid_points, tool_at_zero
+from orthocal.measurement.motion.approach import approach_steps, can_approach, describe_approach
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.conditions import MORNING, schedule_readings
@@ -118,6 +120,26 @@ def test_candidates_begin_their_approach_within_the_travel(machine):
     within = list_candidates(machine, replace(equipment, soft_limits=limits))
     assert [r.key for r in within.readings] == [r.key for r in session.readings]
     assert within.robot is machine
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "linear_delta", "inclined_orthoglide", "biglide"])
+def test_approaches_are_within_the_limits_of_the_axes(name):
+    """Limits of 40 mm; away from the zero the tool moves farther than the drives."""
+    robot = load_robot(name)
+    coordinates = list(robot.tcp.coordinates)
+    axes = np.zeros((3, 2))
+    axes[coordinates] = tool_at_zero(robot)[:, None] + [-0.04, 0.04]
+    joints = [d.joint_limits for d in robot.drives]
+    box = FEW.within_limits(robot, joints, axes).box
+    corners = grid_points(*box)
+    closure = LoopClosure(robot)
+    drives = closure.inverse(corners)
+    for side in "pn":
+        begin = drives - approach_steps(robot, side * len(robot.drives))
+        tool = closure.forward(begin)[:, coordinates]
+        assert (tool >= axes[coordinates, 0] - 1e-9).all()
+        assert (tool <= axes[coordinates, 1] + 1e-9).all()
+    assert (axes[coordinates, 1] - box[:, 1] < 0.006).all()
 
 
 def test_programs_of_a_plan_are_within_the_soft_limits(machine):
