@@ -30,6 +30,9 @@ MAX_FUNCTIONS = 256
 MAX_ROBOTS = 8
 """Robots whose results of a function are held in memory."""
 
+OPTIONS = {"cse": True}
+"""CasADi options of large functions: common subexpressions are computed once."""
+
 _CODE_DIRECTORIES = (
     "kinematics",
     "sensors",

@@ -116,12 +116,8 @@ class LoopClosure:
 
         def solve() -> Array:
             geometry, batch = self._batch(d, errors=values)
-            system = self._closing
-            if allow_free:
-                system = copy.copy(system)
-                system.shortest = True
             passive = solve_closures(
-                system,
+                self._closing_freely if allow_free else self._closing,
                 d,
                 geometry,
                 machines=len(geometry.drive_errors),
@@ -421,6 +417,13 @@ class LoopClosure:
             start=robot.reference_passive,
             origin=map_.command(robot.drive_zero),
         )
+
+    @cached_property
+    def _closing_freely(self) -> System:
+        """The same, solved by the shortest steps."""
+        system = copy.copy(self._closing)
+        system.shortest = True
+        return system
 
     @cached_property
     def _inverting(self) -> System:

@@ -20,7 +20,12 @@ import numpy as np
 from orthocal.arrays import Array, Indices
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
-from orthocal.kinematics.function_cache import cached_function, cached_per_robot, function_key
+from orthocal.kinematics.function_cache import (
+    OPTIONS,
+    cached_function,
+    cached_per_robot,
+    function_key,
+)
 from orthocal.kinematics.se3 import log6_jacobian
 from orthocal.kinematics.symbolic import (
     Pose,
@@ -382,7 +387,7 @@ class RobotFunctions:
             values = [y if i in sparse else ca.densify(y) for i, y in enumerate(outputs())]
             inputs = ["actuated", "passive", "placements"]
             labels = [f"y{i}" for i in range(len(values))]
-            return ca.Function(name, self.symbols, values, inputs, labels)
+            return ca.Function(name, self.symbols, values, inputs, labels, OPTIONS)
 
         return cached_function(function_key(name, self.digest, digest), build)
 

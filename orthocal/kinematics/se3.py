@@ -35,13 +35,16 @@ SERIES_TERMS = 9
 _INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(5 + 2 * SERIES_TERMS))
 """1/n!, for the series of five coefficients."""
 
-LOGARITHM_SERIES_ABOVE = 0.999
-"""Cosine above which the coefficients of the logarithm come from their series."""
+LOGARITHM_SERIES_ABOVE = 0.995
+"""Cosine above which the coefficients of the logarithm come from their series: their first omitted
+terms are below 1e-15 of them there."""
 
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 """Series of θ/sin θ in sin² θ."""
 _BERNOULLI = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 """Series of 1/θ² − (1 + cos θ)/(2 θ sin θ) in θ²."""
+_BERNOULLI_SLOPE = tuple(2.0 * k * c for k, c in enumerate(_BERNOULLI))[1:]
+"""Series of the derivative of this by θ, divided by θ, in θ²."""
 
 
 class _Operations(NamedTuple):
@@ -91,6 +94,14 @@ def log6(rotation: ca.SX, position: ca.SX) -> ca.SX:
     Returns:
         Twist, shape (6,), [m, rad].
     """
+    w, beta, _ = _rotation_log(rotation)
+    hat = ca.skew(w)
+    cross = hat @ position
+    return ca.vertcat(position - 0.5 * cross + beta * (hat @ cross), w)
+
+
+def _rotation_log(rotation: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Logarithm ω of a rotation, β = 1/θ² − (1 + cos θ)/(2 θ sin θ), and (dβ/dθ)/θ."""
     half = 0.5 * ca.inv_skew(rotation - rotation.T)
     cosine = 0.5 * (ca.trace(rotation) - 1.0)
     sine2 = half.T @ half
@@ -99,11 +110,11 @@ def log6(rotation: ca.SX, position: ca.SX) -> ca.SX:
     safe_cosine = ca.if_else(near, 0.0, cosine)
     angle = ca.atan2(sine, safe_cosine)
     w = ca.if_else(near, _polynomial(sine2, _ARCSINE), angle / sine) * half
-    far = 1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * sine)
-    beta = ca.if_else(near, _polynomial(w.T @ w, _BERNOULLI), far)
-    hat = ca.skew(w)
-    cross = hat @ position
-    return ca.vertcat(position - 0.5 * cross + beta * (hat @ cross), w)
+    square, angle2 = w.T @ w, angle**2
+    far = 1.0 / angle2 - (1.0 + safe_cosine) / (2.0 * angle * sine)
+    beta = ca.if_else(near, _polynomial(square, _BERNOULLI), far)
+    far_slope = (0.5 * (1.0 + sine / angle) / (1.0 - safe_cosine) - 2.0 / angle2) / angle2
+    return w, beta, ca.if_else(near, _polynomial(square, _BERNOULLI_SLOPE), far_slope)
 
 
 @overload
@@ -144,13 +155,27 @@ def right_jacobian(twist: Operand) -> Operand:
 
 
 def log6_jacobian(rotation: ca.SX, position: ca.SX) -> ca.SX:
-    """Derivative of log6(M exp6(ξ)) with respect to ξ at 0, shape (6, 6): Jlog6 of Pinocchio."""
-    r, p = ca.SX.sym("r", 3, 3), ca.SX.sym("p", 3)
-    twist = log6(r, p)
-    by_rotation, by_position = ca.jacobian(twist, ca.vec(r)), ca.jacobian(twist, p) @ r
-    rotations = [ca.vec(r @ ca.skew(ca.SX(np.eye(3)[k]))) for k in range(3)]
-    result = ca.horzcat(by_position, by_rotation @ ca.horzcat(*rotations))
-    return ca.Function("log6_jacobian", [r, p], [result])(rotation, position)
+    """Derivative of log6(M exp6(ξ)) with respect to ξ at 0: the inverse of the right Jacobian.
+
+        T⁻¹ = [[A, C A], [0, A]],  A = I + ½ W + β W²,  W = [ω]
+        C = (δ (ω·p) ω − (θ² δ + 2 β) p) ωᵀ + β (ω pᵀ + (ω·p) I) + ½ [p],  δ = (dβ/dθ)/θ
+
+    This is Jlog6 of Pinocchio.
+
+    Args:
+        rotation: Shape (3, 3), a rotation.
+        position: p, shape (3,), [m].
+
+    Returns:
+        Shape (6, 6).
+    """
+    w, beta, slope = _rotation_log(rotation)
+    hat, along = ca.skew(w), w.T @ position
+    inverse = ca.SX.eye(3) + 0.5 * hat + beta * (hat @ hat)
+    column = slope * along * w - (slope * (w.T @ w) + 2.0 * beta) * position
+    coupling = column @ w.T + beta * (w @ position.T + along * ca.SX.eye(3))
+    coupling += 0.5 * ca.skew(position)
+    return ca.blockcat([[inverse, coupling @ inverse], [ca.SX(3, 3), inverse]])
 
 
 def skew(vectors: Array) -> Array:

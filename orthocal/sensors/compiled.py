@@ -25,6 +25,7 @@ from orthocal.effects.protocol import (
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.function_cache import (
+    OPTIONS,
     cached_function,
     fingerprint,
     function_key,
@@ -148,15 +149,15 @@ class ReadingPattern:
 @lru_cache(maxsize=256)
 def _compile(pattern: ReadingPattern) -> CompiledReading:
     """Compile the functions of a pattern, or load them from the cache."""
-    keys = [function_key(f"{name} {pattern.name}", *pattern.digests) for name in FUNCTIONS]
-    value, jacobian = (
-        cached_function(key, partial(_build, pattern, name))
-        for key, name in zip(keys, FUNCTIONS, strict=True)
+    value_key, jacobian_key = (
+        function_key(f"{name} {pattern.name}", *pattern.digests) for name in FUNCTIONS
     )
+    build_value, build_jacobian = (partial(_build, pattern, name) for name in FUNCTIONS)
+    jacobian = cached_function(jacobian_key, build_jacobian)
     rows = [name for name in jacobian.name_out() if name not in ("h", "by_twists")]
     return CompiledReading(
-        value=BatchFunction(value, key=keys[0]),
-        jacobian=BatchFunction(jacobian, matrices=rows, sparse=["by_twists"], key=keys[1]),
+        value=BatchFunction(partial(cached_function, value_key, build_value), key=value_key),
+        jacobian=BatchFunction(jacobian, matrices=rows, sparse=["by_twists"], key=jacobian_key),
         expression=jacobian,
         pattern=pattern,
         pairs=bool(pattern.frames.in_second),
@@ -169,10 +170,11 @@ def _build(pattern: ReadingPattern, name: str) -> ca.Function:
     inputs, outputs = pattern.expressions
     second = SECOND_INPUTS[: len(inputs) - len(INPUTS)]
     if name == FUNCTIONS[0]:
-        return ca.Function("h", inputs, [ca.densify(outputs[0])], [*INPUTS, *second], ["h"])
+        value = ca.densify(outputs[0])
+        return ca.Function("h", inputs, [value], [*INPUTS, *second], ["h"], OPTIONS)
     variables = ("actuated", "passive", "twists", "zero", "nuisance", *second)
     labels = ["h", *(f"by_{name}" for name in variables)]
-    return ca.Function("jacobian", inputs, outputs, [*INPUTS, *second], labels)
+    return ca.Function("jacobian", inputs, outputs, [*INPUTS, *second], labels, OPTIONS)
 
 
 def _express(pattern: ReadingPattern) -> tuple[list[ca.SX], list[ca.SX]]:

@@ -13,7 +13,7 @@ from tolerances import CLOSED, CLOSED_FORM
 
 from orthocal import load_robot
 from orthocal.errors import ClosureError, RobotError
-from orthocal.kinematics import continuation
+from orthocal.kinematics import continuation, loop_closure
 from orthocal.kinematics.loop_closure import LoopClosure, find_beyond_travel, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.measurement.files.coordinate_tables import drive_columns
@@ -118,6 +118,27 @@ def test_the_solution_at_points_is_that_of_the_machine_and_its_conditions(orthog
     assert np.abs(machines[0].forward(first[:, :3]) - points).max() < CLOSED_FORM
     nominal_drives = machines[0].close(first[:, :3])
     assert np.abs(nominal_drives - first[:, 3:]).max() < CLOSED_FORM
+
+
+def test_a_closure_is_solved_once_for_the_same_machine_drives_and_start(orthoglide, monkeypatch):
+    solved = []
+    solve = loop_closure.solve_closures
+
+    def count(*args, **options):
+        solved.append(options["start"])
+        return solve(*args, **options)
+
+    monkeypatch.setattr(loop_closure, "solve_closures", count)
+    drives = orthoglide.drive_zero + np.random.default_rng(11).uniform(-0.02, 0.02, (5, 3))
+    closure = LoopClosure(orthoglide, fixed={"x_slide.offset": 7e-4})
+    first = closure.close(drives)
+    again = closure.close(drives, start=first)
+    again[:] = 0.0  # a solution that is kept is nobody's to change
+    assert np.abs(closure.close(drives, start=first) - first).max() < CLOSED_FORM
+    assert len(solved) == 2
+    closure.close(drives, start=first + 1e-5)
+    LoopClosure(orthoglide).close(drives, start=first)
+    assert len(solved) == 4
 
 
 def test_a_posture_out_of_reach_is_abandoned_early(orthoglide, monkeypatch):

@@ -81,6 +81,14 @@ def test_derivatives_equal_those_of_the_expressions(request, name, size):
         assert np.abs(ours - wanted).max() < KINEMATICS
 
 
+@pytest.mark.parametrize("name", ["closure_by_passive", "closure_and_tool", "closure_jacobian"])
+def test_common_subexpressions_are_computed_once(orthoglide, name):
+    function = getattr(robot_functions(orthoglide), name).function
+    symbols = function.sx_in()
+    shared = ca.Function("shared", symbols, ca.cse(function.call(symbols)))
+    assert function.n_instructions() == shared.n_instructions()
+
+
 def test_robots_share_functions_only_where_they_are_the_same(orthoglide):
     """One that was moved, though from the same file, has functions of its own."""
     again, moved = load_afresh("orthoglide"), orthoglide.with_errors({"x_bar_a.x": 1e-3})

@@ -86,6 +86,15 @@ def test_jacobians_equal_pinocchios(angle):
         assert np.abs(found - pin.Jlog6(pose)).max() < 10 * KINEMATICS
 
 
+@pytest.mark.parametrize("angle", [1e-3, 0.0447, 0.0999, 0.1002, 0.3, 2.0, 3.0])
+def test_the_jacobian_of_the_logarithm_is_the_inverse_of_that_of_the_exponential(angle):
+    """Also beside the limit of its series, an angle of 0.1 rad."""
+    xi = twist_of(angle)
+    rotation, position = exp6(xi)
+    inverse = np.asarray(ca.DM(ca.evalf(log6_jacobian(ca.SX(rotation), ca.SX(position)))))
+    assert np.abs(inverse @ right_jacobian(xi) - np.eye(6)).max() < 10 * KINEMATICS
+
+
 def test_batches_equal_single_twists():
     xi = np.array([[twist_of(a, s) for a in ANGLES] for s in (1, 2, 3)])
     rotations, positions = exp6(xi)

@@ -11,6 +11,7 @@ from orthocal.builder.build import make_robot
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ClosureError, RobotError
+from orthocal.kinematics import reachable_box
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import box_workspace, gauss_box, uniform_grid
@@ -36,6 +37,20 @@ def test_a_stated_workspace_is_read_from_the_yaml(tmp_path):
 def test_the_default_is_a_cube_of_60_mm(orthoglide):
     assert orthoglide.workspace is None
     assert find_workspace(orthoglide).words == "the workspace ±60 mm"
+
+
+def test_the_default_workspace_is_kept_on_disk(tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
+    find_default = reachable_box._default_workspace.__wrapped__  # without the cache in memory
+    small = make_robot(Orthoglide(leg=0.28, travel=(0.15, 0.34)), tmp_path / "small")
+    longer = make_robot(Orthoglide(leg=0.28, travel=(0.15, 0.36)), tmp_path / "longer")
+    found, other = find_default(small), find_default(longer)
+    assert found.half_side < other.half_side
+    monkeypatch.setattr(reachable_box, "_largest_box", None)
+    for robot, expected in ((small, found), (longer, other)):
+        kept = find_default(robot)
+        assert np.array_equal(kept.limits, expected.limits)
+        assert np.array_equal(kept.points, expected.points)
 
 
 def test_a_machine_that_reaches_more_keeps_the_default_of_the_nominal_one(tmp_path):

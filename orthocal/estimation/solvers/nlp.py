@@ -19,7 +19,7 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import Hessian
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.symbolic_problem import ReadingExpressions, SymbolicProblem
-from orthocal.kinematics.function_cache import cached_function, fingerprint, function_key
+from orthocal.kinematics.function_cache import OPTIONS, cached_function, fingerprint, function_key
 
 
 class SparseSum:
@@ -337,6 +337,7 @@ class ProgramFunctions:
                     ca.densify(ca.substitute(v, expressions.nuisance, nuisance) if n_u else v)
                     for v in values
                 ],
+                OPTIONS,
             )
             for name, values in outputs.items()
         }
@@ -395,7 +396,7 @@ class ProgramFunctions:
             inputs = [symbolic.passive, symbolic.command, *symbolic.error_map.symbols]
             closure, jacobian = symbolic.closure
             value = ca.densify(closure) if name == "closure" else ca.sparsify(jacobian)
-            return ca.Function(name, inputs, [value])
+            return ca.Function(name, inputs, [value], OPTIONS)
 
         return self._cached(name, build)
 
@@ -433,6 +434,7 @@ class ProgramFunctions:
                 ca.densify(second.nz[np.flatnonzero(part).tolist()])
                 for part in (summed_part, ~summed_part)
             ],
+            OPTIONS,
         )
         masks = [False, False, True, False], [True, False]
         summed, local = function.map(len(variables), *masks)(*arguments)

@@ -22,7 +22,7 @@ Backend = Literal["casadi", "llvm"]
 LARGE_BLOCK, SMALL_BLOCK = 32, 8
 """Points of one call of a mapped CasADi function."""
 
-CALL_COST = 2000
+CALL_COST = 2500
 """Duration of a call, in instructions."""
 
 MIN_POINTS, MIN_OPERATIONS = 3, 2e3
