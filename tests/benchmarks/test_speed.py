@@ -175,7 +175,7 @@ def record(record_property):
     """Keeps a figure with the test's report, and shows it with -s."""
 
     def keep(name, value):
-        record_property(name, value)
+        record_property(name, float(value))
         print(f"\n{name}: {value:.4g}", end="")  # noqa: T201
 
     return keep
