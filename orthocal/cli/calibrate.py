@@ -27,7 +27,7 @@ class ChoiceOptions:
         prior: Use the tolerances in the fit; default: yes, except where only offsets are
             identified.
         bound (PATTERN=LOW:HIGH): Bounds such as 'x_slide.offset_mm=-2:2', or of one side '=-2:'.
-        base: For research: estimate one of several redundant errors, without tolerances.
+        base: For research: estimate the combinations that readings determine, without tolerances.
     """
 
     model: str | None = None

@@ -7,10 +7,10 @@ with
 
 for the objective F (Bates and Watts, Nonlinear Regression Analysis, 1988, section 6.1). U_F is the
 expanded uncertainty from noise and priors, and s² = [A⁻¹]ᵢᵢ with the curvature A of F. In a linear
-problem the ends are the estimate ± U_F. For a stated noise q is the coverage factor. If the
-tolerance scale explains the residuals, F weighs them by more than their noise, and q is smaller: it
-is the correction of a likelihood with other variances than the true ones (Kent, Biometrika 69,
-1982). Unmodelled errors are not parameters of F. They widen each side in quadrature.
+problem the ends are the estimate ± U_F. For a stated noise and a tolerance scale of 1, q is 2. If
+the tolerance scale explains the residuals, F weighs them by more than their noise, and q is
+smaller: it is the correction of a likelihood with other variances than the true ones (Kent,
+Biometrika 69, 1982). Unmodelled errors are not parameters of F. They widen each side in quadrature.
 """
 
 from __future__ import annotations
