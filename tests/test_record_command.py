@@ -262,7 +262,7 @@ drop 7; 0.1; repeat 2; repeat 7 | 0.10 | Not recorded: line 7 was not read yet.
     `restart` deletes 3 readings of yx.
 0.1; 0.1; 0.1; 0.1; restart; restart 2; restart | 0.10 0.10 0.10 0.10 |
     `restart` deletes 3 readings of yx.
-restart; 0.3 | 0.30 | Deleted: all readings of yx
+restart; 0.3 | 0.30 | yx has no readings yet. `restart 7`
 0.1; 0.2; 0.3; 0.4; restart 3; restart 3; 0.5 | 0.50 - - 0.40 |
     Deleted: all readings of yx Setup yx, 1 of 2
 restart 1 | - | Not recorded: '1' is not a line; expected 2 to 7.

@@ -548,7 +548,11 @@ class Dialogue:
         recording.empty(index)
         self._skipped -= {recording.rows[i].key for i in indices}
         self._shown, self._last = None, None
-        self._note(f"Deleted: all readings of {setup}")
+        self._note(
+            f"Deleted: all readings of {setup}"
+            if count
+            else f"{setup} has no readings yet. `restart 7` reads the setup of line 7 again."
+        )
         self._judge()
         self._ask_for(indices[0])
 
