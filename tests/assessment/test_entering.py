@@ -219,7 +219,7 @@ def test_the_next_step_is_the_correction_of_all_errors(entered):
     first, kept = entered
     assert lowers(kept.assessment.tool.now, kept.assessment.tool.compensated)
     answer = to_text(render_answer(kept, saved=Path("out")))
-    assert "orthocal export out --to linuxcnc --out out-linuxcnc" in answer
+    assert "orthocal export out --to linuxcnc --ini FILE --out out-linuxcnc" in answer
     assert "orthocal correct out PROGRAM.ngc" in answer
     assert "orthocal again" not in answer
     assert "orthocal again out" in to_text(render_answer(first, saved=Path("out")))
@@ -240,7 +240,7 @@ def test_sessions_before_and_after_entering_end_with_a_correction(entered):
     assert lowers(joint.assessment.tool.entered, joint.assessment.tool.compensated)
     keep = joint.assessment.keeps_offsets
     answer = to_text(render_answer(joint, saved=Path("out")))
-    assert "orthocal export out --to linuxcnc --out out-linuxcnc" in answer
+    assert "orthocal export out --to linuxcnc --ini FILE --out out-linuxcnc" in answer
     assert ("orthocal correct out PROGRAM.ngc --offsets active" in answer) is not keep
     assert "orthocal again" not in answer
     assert "measure again" not in answer

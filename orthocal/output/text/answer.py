@@ -255,7 +255,7 @@ def _next_step(
         active = "" if unchanged else " --offsets active"
         return words, (
             *(() if unchanged else (offsets,)),
-            f"orthocal export {directory} --to linuxcnc --out {module}",
+            f"orthocal export {directory} --to linuxcnc --ini FILE --out {module}",
             f"orthocal correct {directory} PROGRAM.ngc{active} --out CORRECTED.ngc",
         )
     changes = [] if unchanged else ["the offsets"]
