@@ -70,7 +70,8 @@ class ApproachSides:
 
     def __init__(self, calibration: Calibration, offsets: Array, lags: Array) -> None:
         robot = calibration.robot
-        self.last = np.zeros(len(robot.drives))
+        self.current = np.zeros(len(robot.drives))
+        self.farthest = np.full(len(robot.drives), np.nan)
         self._axes = np.array(require_commanded_tool(robot))
         self._lags = lags
         self._offsets = offsets

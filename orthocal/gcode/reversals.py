@@ -15,13 +15,14 @@ LARGEST_ANGLE = math.pi / 8.0
 """Largest angle of a part of an arc, in which a drive reverses at most once, [rad]."""
 
 STEP = 1e-4
-"""Step of the parameter of a motion for the direction of a drive."""
+"""Step of the parameter of a motion for the direction of a drive. Reversals nearer to its ends are
+those between motions."""
 
 BISECTIONS = 24
 """Number of bisections for the parameter of a reversal."""
 
 SMALLEST_MOVE = 1e-7
-"""Change of a drive's coordinate along a part below which the drive rests, [m, rad]."""
+"""Motion back from its farthest coordinate below which a drive has not reversed, [m, rad]."""
 
 
 class Sides(Protocol):
@@ -31,8 +32,11 @@ class Sides(Protocol):
     unknown.
     """
 
-    last: Array
+    current: Array
     """Sides after the last motion, shape (n_drives,)."""
+    farthest: Array
+    """Farthest coordinates of the drives on these sides, shape (n_drives,), [m, rad]; NaN before
+    the first motion."""
 
     def drives(self, points: Array) -> Array:
         """Drive coordinates at tool positions, which show the direction of the drives.
@@ -68,14 +72,15 @@ class Parts:
     """Parameter of the end of each part on its motion, shape (k,)."""
     sides: Array
     """Sides of the drives on each part, shape (k, n_drives)."""
-    reversed: Mask
-    """True if a side differs from that of the previous part, shape (k,)."""
+    takes_up: Mask
+    """True if backlash is taken up at the start of a part: a side changes or becomes known, shape
+    (k,)."""
     bounds: list[int]
     """First part of each motion, and the number of all parts."""
 
 
 def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
-    """Divide motions where a drive reverses; updates `sides.last` to the end of the last motion."""
+    """Divide motions where a drive reverses; updates `sides` to the end of the last motion."""
     counts = np.maximum(np.ceil(np.abs(paths.angle[:, 1]) / LARGEST_ANGLE), 1.0).astype(np.int64)
     motion = np.repeat(np.arange(len(counts)), counts)
     number = np.arange(motion.size) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -85,25 +90,52 @@ def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
     starts = np.unique(np.vstack([starts, reversals]), axis=0)
     motion, first = starts[:, 0].astype(np.int64), starts[:, 1]
     last = _part_ends(motion, first)
-    travel = sides.drives(paths.points(motion, last)) - sides.drives(paths.points(motion, first))
-    moves = np.abs(np.nan_to_num(travel)) > SMALLEST_MOVE
-    part_sides = np.vstack([sides.last[None], np.where(moves, np.sign(travel), 0.0)])
-    # a resting drive keeps its side: fill zeros forwards
-    index = np.where(part_sides != 0.0, np.arange(len(part_sides))[:, None], 0)
-    filled = np.take_along_axis(part_sides, np.maximum.accumulate(index, axis=0), axis=0)
-    reverses = (filled[1:] != filled[:-1]).any(axis=1)
-    sides.last = filled[-1]
+    begins, ends = (sides.drives(paths.points(motion, t)) for t in (first, last))
+    followed = [
+        _follow_drive(*of_drive)
+        for of_drive in zip(begins.T, ends.T, sides.current, sides.farthest, strict=True)
+    ]
+    part_sides = np.column_stack([of_parts for of_parts, _ in followed])
+    reverses = (part_sides != np.vstack([sides.current, part_sides[:-1]])).any(axis=1)
+    sides.current, sides.farthest = part_sides[-1], np.array([far for _, far in followed])
     is_start = (first == 0.0) | reverses  # parts without a reversal belong to the previous part
     motion, first = motion[is_start], first[is_start]
-    ends = np.cumsum(np.bincount(motion, minlength=len(counts))).tolist()
+    bounds = np.cumsum(np.bincount(motion, minlength=len(counts))).tolist()
     return Parts(
         motion,
         first,
         _part_ends(motion, first),
-        filled[1:][is_start],
+        part_sides[is_start],
         reverses[is_start],
-        [0, *ends],
+        [0, *bounds],
     )
+
+
+def _follow_drive(begins: Array, ends: Array, side: float, farthest: float) -> tuple[Array, float]:
+    """Sides of a drive on parts, also if it moves by less than SMALLEST_MOVE in each.
+
+    A point out of reach leaves the side unchanged: such motions are refused.
+
+    Args:
+        begins: Coordinates at the starts of the parts, shape (k,), [m, rad]; NaN out of reach.
+        ends: Those at the ends.
+        side: Side before the first part.
+        farthest: Farthest coordinate on this side, [m, rad]; NaN if unknown.
+
+    Returns:
+        Sides, shape (k,), and the farthest coordinate on the last one.
+    """
+    part_sides = np.empty(len(ends))
+    for i, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+        if not abs(begin - farthest) <= SMALLEST_MOVE:  # unknown, or other motions led to the start
+            farthest = begin
+        change = end - farthest
+        if abs(change) > SMALLEST_MOVE:
+            side = math.copysign(1.0, change)
+        if side * change > 0.0:
+            farthest = end
+        part_sides[i] = side
+    return part_sides, farthest
 
 
 def _part_ends(motion: Indices, first: Array) -> Array:

@@ -108,7 +108,7 @@ def segment_motions(
 
     segments = _segment(parts, correct_on_sides, tolerance)
     return [
-        _join([segments[k] for k in range(*ends)], reversals.reversed[slice(*ends)])
+        _join([segments[k] for k in range(*ends)], reversals.takes_up[slice(*ends)])
         for ends in pairwise(reversals.bounds)
     ]
 

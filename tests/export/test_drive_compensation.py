@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 from unittest.mock import patch
 
 import numpy as np
@@ -684,32 +684,57 @@ SIDED = 1.0e-6
 """Part of the periodic errors that depends on the side, in drives: 0.2 µm each, [m]."""
 
 
+class DrivesAsCoordinates:
+    """Sides of drives that are the coordinates of the tool."""
+
+    def __init__(self):
+        self.current, self.farthest = np.zeros(3), np.full(3, np.nan)
+
+    def drives(self, points):
+        return points
+
+    def command(self, points, sides):
+        return points
+
+
 def test_motions_are_divided_where_a_drive_reverses():
     """If the drives are the coordinates, a circle reverses each of two twice."""
-
-    class Plain:
-        last = np.zeros(3)
-
-        def drives(self, points):
-            return points
-
-        def command(self, points, sides):
-            return points
 
     at = (10e-3, 0.0, 0.0)
     arc = arc_about(at, at, (0.0, 0.0), plane=17, clockwise=False, turns=1)
     paths = Paths.from_motions(
         [Motion((0.0, 0.0, 0.0), at), Motion(at, at, arc), Motion(at, (0.0, 0.0, 5e-3))]
     )
-    sides = Plain()
+    sides = DrivesAsCoordinates()
     parts = split_at_reversals(paths, sides)
     assert parts.motion.tolist() == [0, *[1] * 4, 2]
     assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
     assert parts.sides.astype(int).tolist() == [
         *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1])
     ]
-    assert parts.reversed.all()
-    assert sides.last.tolist() == [-1.0, 1.0, 1.0]
+    assert parts.takes_up.all()
+    assert sides.current.tolist() == [-1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("at_once", [1000, 7])
+def test_drives_that_move_slowly_reverse_too(at_once):
+    """Lines of 0.01 mm in x, in which z moves by 0.09 µm up, then down, while y trembles."""
+    up = np.repeat([1.0, -1.0], 50)
+    lines = np.arange(101.0)[:, None] * [1e-5, 0.0, 0.0]
+    lines[1:, 2] = 0.09e-6 * np.cumsum(up)
+    lines[:, 1] = 0.04e-6 * (-1.0) ** np.arange(101)
+    motions = [Motion(a, b) for a, b in pairwise(map(tuple, lines))]
+    sides, found, taken_up = DrivesAsCoordinates(), [], []
+    for first in range(0, 100, at_once):
+        parts = split_at_reversals(Paths.from_motions(motions[first : first + at_once]), sides)
+        found += parts.sides.astype(int).tolist()
+        taken_up += parts.takes_up.tolist()
+    assert found == [[1, 0, 0], *[[1, 0, 1]] * 50, *[[1, 0, -1]] * 49]
+    assert np.flatnonzero(taken_up).tolist() == [0, 1, 51]
+    # after a motion that was not followed, only the direction counts
+    sides.farthest = np.full(3, 1.0)
+    split_at_reversals(Paths.from_motions([Motion((0.0, 0.0, 0.0), (1e-3, 0.0, 0.0))]), sides)
+    assert sides.current.tolist() == [1.0, 0.0, -1.0]
 
 
 def test_latch_direction_is_positive_by_default(calibration):
