@@ -70,6 +70,7 @@ def export(
         home_offsets=_home_offsets(home_offset, joints, result),
         latched=_latched(latched, joints),
         joint_limits=joints.limits if joints else None,
+        axis_limits=joints.axis_limits if joints else None,
         half_side=None if half_side_mm is None else half_side_mm * MM,
         payload=payload,
         module=module,

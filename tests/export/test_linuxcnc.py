@@ -438,6 +438,22 @@ def test_module_of_offsets_alone(offsets):
     assert "at most 0.001 µm" in files["README.md"]
 
 
+def test_limits_of_the_axes_are_those_of_region_and_controller(offsets):
+    """The controller displays 2 mm less in X than the module will."""
+    session = replace(offsets.session, controller_origin=(-0.002, 0.0, 0.0))
+    moved = replace(offsets, session=session)
+    axes = ((-0.045, 0.04), (-0.07, 0.03), (-np.inf, np.inf))
+    options = ExportOptions(module=True, axis_limits=axes)
+    with few_nodes():
+        files = export_calibration(moved, "linuxcnc", options=options)
+    limits = re.findall(r"AXIS_(.)]\nMIN_LIMIT = (\S+)\nMAX_LIMIT = (\S+)", files["kinematics.ini"])
+    assert limits == [("X", "-43", "42"), ("Y", "-60", "30"), ("Z", "-60", "60")]
+    assert "to it and to the limits of your INI file" in files["README.md"]
+    axes = ((-0.045, 0.04), (0.06, 0.09), (-np.inf, np.inf))
+    with few_nodes(), pytest.raises(ParameterError, match=r"--ini: \[AXIS_Y\] has .* 60, 90 mm"):
+        export_linuxcnc(moved, replace(options, axis_limits=axes))
+
+
 def test_offsets_of_a_complete_model(full):
     """HOME_OFFSET has the offsets that minimise the tool error, not the identified ones."""
     old = (0.35, 0.3, -0.02)

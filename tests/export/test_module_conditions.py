@@ -189,7 +189,7 @@ def test_page_states_temperature_and_payload(thermal):
     known, approximation, _ = thermal
     known = SimpleNamespace(**vars(known), only_offsets=False)
     loaded = replace(approximation, payload=0.5, error_of_heavier_payload=1.2e-6)
-    page = write_module_page(known, loaded, homes_of(known))
+    page = write_module_page(known, loaded, homes_of(known), own_limits=False)
     assert "`orthocal.temperature`" in page
     assert "From 7 to 37 °C" in page
     assert "for 0.5 kg on the tool" in page

@@ -11,7 +11,12 @@ from orthocal.assessment.controller_entries import find_entries, find_screws
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.compensation import compensates_alike, format_table, home_positions
 from orthocal.errors import ExportError, ParameterError
-from orthocal.export.linuxcnc.approximation import approximate
+from orthocal.export.linuxcnc.approximation import (
+    LETTERS,
+    Approximation,
+    approximate,
+    millimetres,
+)
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.drive_compensation import (
     JointCompensation,
@@ -41,6 +46,7 @@ OPTIONS = {
     "home_offsets": "--home-offset",
     "latched": "--latched",
     "joint_limits": "--ini",
+    "axis_limits": "--ini",
     "half_side": "--half-side-mm",
     "payload": "--payload",
     "module": "--module or --offsets",
@@ -71,6 +77,9 @@ class ExportOptions:
     joint_limits: tuple[tuple[float, float], ...] | None = None
     """MIN_LIMIT and MAX_LIMIT of each joint during the measurement, [m, rad]. The travel of the
     robot limits them too."""
+    axis_limits: tuple[tuple[float, float], ...] | None = None
+    """MIN_LIMIT and MAX_LIMIT of the axes X, Y and Z during the measurement, [m]. The region of a
+    kinematics module limits them too."""
     half_side: float | None = None
     """Half the side of the module's region around the mechanical zero, [m]."""
     payload: float | None = None
@@ -96,7 +105,7 @@ class ExportOptions:
         for sign in self.latched or ():
             if sign not in (-1, 0, 1):
                 raise ParameterError(f"found {sign!r}; expected 1, 0 or -1", where="--latched")
-        for low, high in self.joint_limits or ():
+        for low, high in (*(self.joint_limits or ()), *(self.axis_limits or ())):
             if not low < high:
                 raise ParameterError(
                     f"found limits {low:g} and {high:g}; expected the lowest and the highest",
@@ -161,13 +170,50 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         half_side=options.half_side,
         payload=options.payload,
     )
+    limits = _limit_axes(approximation, options.axis_limits, calibration.session.controller_origin)
     return {
-        "README.md": write_module_page(calibration, approximation, homes),
-        "kinematics.ini": write_module_lines(approximation, homes),
+        "README.md": write_module_page(
+            calibration, approximation, homes, own_limits=options.axis_limits is not None
+        ),
+        "kinematics.ini": write_module_lines(approximation, homes, limits),
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
         **tables,
     }
+
+
+def _limit_axes(
+    approximation: Approximation,
+    stated: tuple[tuple[float, float], ...] | None,
+    origin: tuple[float, float, float],
+) -> dict[int, tuple[float, float]]:
+    """Limits that the region of a module and the stated limits have in common, [m].
+
+    Args:
+        approximation: The module.
+        stated: MIN_LIMIT and MAX_LIMIT of X, Y and Z with nominal kinematics, [m].
+        origin: Displayed coordinates of the origin of the world with nominal kinematics, [m]; with
+            the module they are 0.
+
+    Returns:
+        Limits by coordinate: 0 for X, and so on.
+
+    Raises:
+        ParameterError: If they have nothing in common; names the axis.
+    """
+    inverse, limits = approximation.inverse, {}
+    for k, low, high in zip(
+        approximation.coordinates, inverse.lower.tolist(), inverse.upper.tolist(), strict=True
+    ):
+        own = (-math.inf, math.inf) if stated is None else stated[k]
+        limits[k] = max(low, own[0] - origin[k]), min(high, own[1] - origin[k])
+        if not limits[k][0] < limits[k][1]:
+            raise ParameterError(
+                f"[AXIS_{LETTERS[k]}] has the limits {millimetres(own)} mm; expected a part of the "
+                f"region of the module, {millimetres([low + origin[k], high + origin[k]])} mm",
+                where="--ini",
+            )
+    return limits
 
 
 def _refuse_module_options(options: ExportOptions) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from orthocal.assessment.assess import assessment_of
@@ -81,9 +81,18 @@ def _latching_sign(home: JointHome) -> str:
     return "+" if home.compensation.latches_upwards else "-"
 
 
-def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
-    """INI lines for the kinematics module: limits of the axes, unchanged joints."""
-    coordinates, inverse = approximation.coordinates, approximation.inverse
+def write_module_lines(
+    approximation: Approximation,
+    homes: Sequence[JointHome],
+    limits: Mapping[int, tuple[float, float]],
+) -> str:
+    """INI lines for the kinematics module: limits of the axes, unchanged joints.
+
+    Args:
+        approximation: The module.
+        homes: The joints.
+        limits: Limits by coordinate, 0 for X, and so on, [m].
+    """
     lines = [
         "# Calibrated kinematics module. HOME_OFFSET remains that of the measurement.",
         *_latching_lines(homes),
@@ -93,11 +102,11 @@ def write_module_lines(approximation: Approximation, homes: Sequence[JointHome])
         f"JOINTS = {len(homes)}",
         "",
         "[TRAJ]",
-        f"COORDINATES = {''.join(LETTERS[k] for k in sorted(coordinates))}",
+        f"COORDINATES = {''.join(LETTERS[k] for k in sorted(limits))}",
         "LINEAR_UNITS = mm",
         "ANGULAR_UNITS = degree",
     ]
-    for k, low, high in zip(coordinates, inverse.lower, inverse.upper, strict=True):
+    for k, (low, high) in limits.items():
         lines += [
             "",
             f"[AXIS_{LETTERS[k]}]",
@@ -357,9 +366,20 @@ def _describe_limits(homes: Sequence[JointHome], *, own: bool) -> str:
 
 
 def write_module_page(
-    calibration: Calibration, approximation: Approximation, homes: Sequence[JointHome]
+    calibration: Calibration,
+    approximation: Approximation,
+    homes: Sequence[JointHome],
+    *,
+    own_limits: bool,
 ) -> str:
-    """README.md of a kinematics module: steps to build and enter it, errors and limits."""
+    """README.md of a kinematics module: steps to build and enter it, errors and limits.
+
+    Args:
+        calibration: The calibration.
+        approximation: The module.
+        homes: The joints.
+        own_limits: Whether the limits of the axes are also those of the controller.
+    """
     inverse = approximation.inverse
     polynomial = inverse.correction
     letters = [c for k, c in enumerate(LETTERS) if k not in approximation.coordinates]
@@ -397,6 +417,7 @@ def write_module_page(
         "drives": ", ".join(comment_safe(h.drive.name) for h in homes),
         "others": ", ".join(letters),
         "beyond": beyond,
+        "own_limits": " and to the limits of your INI file" if own_limits else "",
         "longer_mm": f"{LONGER_TOOL / MM:g}",
         "longer": rounded_up(approximation.error_of_longer_tool / UM),
     }
