@@ -440,7 +440,7 @@ def test_invalid_answers_are_asked_for_again(tmp_path):
     assert said.count("Leg length, from hinge to hinge of a rod, mm: ") == 3
     assert "  legs of 250000 mm; expected 20 to 5000 mm" in said
     assert "  travel from 10 to 600 mm; legs of 250 mm reach 25 to 475 mm" in said
-    assert "  rods of radius 40 mm, 60 mm apart; expected them to clear each other" in said
+    assert "  rods of radius 40 mm, 60 mm apart; expected a radius above 0" in said
     assert "  found 'sideways'; expected up or down" in said
     assert "  the machine does not reach the workspace ±90 mm" in said
     assert "  found '40:30'; expected half the side of a cube" in said

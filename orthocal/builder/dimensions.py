@@ -185,7 +185,8 @@ def find_rods_problem(apart: float, radius: float, leg: float) -> tuple[str, str
         return None
     return "rod_radius" if 0.0 < apart <= leg else "rods_apart", (
         f"rods of radius {in_mm(radius)} mm, {in_mm(apart)} mm apart; "
-        f"expected them to clear each other, within {in_mm(leg)} mm"
+        f"expected a radius above 0, and a distance above twice the radius and at most "
+        f"{in_mm(leg)} mm"
     )
 
 

@@ -64,7 +64,7 @@ def load_calibration(path: str | Path) -> Calibration:
         raise CalibrationFileError(f"is missing; expected '{SCHEMA}'", where=f"{file}: schema")
     if isinstance(data, Mapping) and data["schema"] != SCHEMA:
         raise CalibrationFileError(
-            f"schema is '{data.get('schema')}'; expected '{SCHEMA}'", where=str(file)
+            f"found '{shorten(str(data['schema']))}'; expected '{SCHEMA}'", where=f"{file}: schema"
         )
     return _read_document(data, str(file), path=file)
 
@@ -226,8 +226,8 @@ def _check_estimates(calibration: Calibration, file: str) -> None:
     free = [(i, p) for i, p in enumerate(calibration.parameters) if p.free]
     for key, variance in variances.items():
         for (i, p), size in zip(free, np.sqrt(np.abs(variance)).tolist(), strict=True):
-            if math.isfinite(size):
-                _check_derived(getattr(p, key), size, file, f"parameters[{i}].{key}")
+            stated, expected = finite_or_none(getattr(p, key)), finite_or_none(size)
+            _check_derived(stated, expected, file, f"parameters[{i}].{key}")
 
 
 def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]:
@@ -261,16 +261,16 @@ def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]
             yield f"gauges[{i}].range", "expected the lowest reading, then the highest"
     values, rank = record.identifiability.singular_values, record.identifiability.rank
     if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
-        yield "identifiability.singular_values", "expected positive numbers, the largest first"
+        yield "identifiability.singular_values", "expected numbers of at least 0, the largest first"
     if rank > len(values) or (rank and values[rank - 1] <= 0.0):
         positive = (values > 0.0).sum()
         yield "identifiability.rank", f"found {rank}; only {positive} singular values are above 0"
 
 
 def _is_covariance(matrix: Array) -> bool:
-    """True for symmetric numbers without negative variances, and for unknown (NaN) covariances."""
+    """True for symmetric numbers without negative variances, and for NaN only: unknown."""
     if not np.isfinite(matrix).all():
-        return True
+        return bool(np.isnan(matrix).all())
     std = np.sqrt(np.abs(np.diag(matrix)))
     correlation = matrix / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
     symmetric = np.abs(matrix - matrix.T).max() <= DERIVED_TOLERANCE * np.abs(matrix).max()

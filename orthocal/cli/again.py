@@ -196,7 +196,7 @@ def _describe_entries(
         path: Path of this calibration.
         ini: INI file whose lines contain the offsets of the session; None if no file is known to.
     """
-    from orthocal.effects.compensation import describe_trims
+    from orthocal.effects.compensation import describe_trims, home_positions
 
     drives = new.robot.drives
     offsets = _list_lengths(drives, new.active_offsets)
@@ -220,7 +220,8 @@ def _describe_entries(
     if backlash := describe_trims(new.robot, new.compensation):
         text += (
             f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "
-            "remove it from `controller` in session.yaml."
+            "state under `controller` in session.yaml what it compensates, 0 for none"
+            f"{', and its HOME_OFFSET' * (home_positions(new.compensation) is not None)}."
         )
     return (
         f"{text}\nThen home, measure and compare. Also name all other sessions that were measured "

@@ -51,7 +51,7 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     Raises:
         RobotError: If the files do not describe a robot; names the file and the line or key.
     """
-    return _add_parameters(load_bare_robot(robot, beside=beside))
+    return _add_loaded_parameters(load_bare_robot(robot, beside=beside))
 
 
 def load_robot_content(
@@ -67,7 +67,7 @@ def load_robot_content(
     Raises:
         RobotError: If the files do not describe a robot; names NAME/FILE and the line or key.
     """
-    return _add_parameters(load_bare_content(name, content, folder=folder))
+    return _add_loaded_parameters(load_bare_content(name, content, folder=folder))
 
 
 def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
@@ -75,8 +75,8 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
 
     Args:
         robot: The robot; tolerances that were stated for it remain.
-        names: Names of the effects, in any order; None for those in its YAML. Other effects have
-            their default keys.
+        names: Names of the effects, in any order; None for those in its YAML. Effects that the
+            YAML does not state have their default keys.
 
     Raises:
         ParameterError: If an effect does not exist, or a stated tolerance belongs to an effect that
@@ -111,6 +111,11 @@ def _with_parameters(robot: Robot) -> Robot:
 
 
 @lru_cache(maxsize=MAX_LOADED)
+def _add_loaded_parameters(robot: Robot) -> Robot:
+    """`_add_parameters` of a robot of unchanged files, cached."""
+    return _add_parameters(robot)
+
+
 def _add_parameters(robot: Robot) -> Robot:
     """Robot with the error parameters of its effects."""
     where, declared = f"{robot.yaml}: orthocal", robot.declared

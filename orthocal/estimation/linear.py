@@ -30,6 +30,9 @@ TWELVE_ROWS = tuple(
 minimum posture minus that in the zero posture. The last block is (Δx_z, Δz_x).
 """
 
+LEAST_RESIDUAL = 1e-12
+"""Least scale of the residuals in a problem with bounds, [m], or [1] with a prior."""
+
 SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
 """Rows of the reduced system, maximum minus minimum, in the order of the paper's Table 1."""
 
@@ -175,7 +178,9 @@ class LinearProblem:
         if ((step < lower) | (step > upper)).any():
             from scipy.optimize import lsq_linear
 
-            step = lsq_linear(jacobian, residual, bounds=(lower, upper), method="bvls").x
+            unit = max(float(np.linalg.norm(residual)), LEAST_RESIDUAL)  # its tolerance is absolute
+            options = {"bounds": (lower, upper), "method": "bvls", "tol": 1e-15}
+            step = lsq_linear(jacobian / unit, residual / unit, **options).x
         return np.asarray((reference + step) * problem.theta_scale)
 
 

@@ -17,7 +17,7 @@ from orthocal import (
     write_session,
 )
 from orthocal.calibration.identify import identify
-from orthocal.effects.loading import robot_effects, with_effects
+from orthocal.effects.loading import load_robot, robot_effects, with_adjustments, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.measurement.joining import join_sessions
 
@@ -67,6 +67,13 @@ def test_tolerances_stay_with_a_choice_of_effects(plan):
     assert with_effects(stated, ["backlash"]).parameters["x_slide.backlash"].prior_std == 0.05e-3
     with pytest.raises(ParameterError, match="backlash"):
         with_effects(stated, ["thermal"])
+
+
+def test_choices_of_effects_leave_loaded_robots_in_memory(orthoglide):
+    for number in range(1, 11):
+        with_effects(orthoglide.with_tolerances({"*.offset_mm": number}), ["backlash"])
+        with_adjustments(orthoglide.with_tolerances({"*.offset_mm": number}))
+    assert load_robot("orthoglide") is orthoglide
 
 
 def test_an_unknown_effect_and_a_missing_key_are_refused(orthoglide):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from gauges import exact
@@ -10,6 +12,7 @@ from tolerances import KINEMATICS, PRINTED
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.linear import (
     TWELVE_ROWS,
+    LinearProblem,
     invert_equation_8,
     leg_parallelism_matrix,
     linearise_problem,
@@ -107,3 +110,19 @@ def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(exact_plan):
         leg_parallelism_matrix(**GEOMETRY), covariance=twelve_row_covariance()
     )
     assert np.abs(theta - inverse @ differences).max() < 1e-12
+
+
+def test_small_residuals_have_their_optimum_within_bounds():
+    """There the objective has no gradient, but towards a bound."""
+    bounds = SimpleNamespace(lower=np.zeros(8), upper=np.full(8, np.inf))
+    none = {"active_theta": np.zeros(8), "prior_precision": np.zeros(8), "has_prior": False}
+    problem = SimpleNamespace(n_free=8, theta_scale=np.ones(8), selection=bounds, **none)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        jacobian, residual = 2e-5 * rng.normal(size=(12, 8)), 2e-6 * rng.normal(size=12)
+        found = LinearProblem(problem, residual, jacobian, None).solve(sigma=1e-6)
+        descent = jacobian.T @ (residual - jacobian @ found)
+        largest = 1e-9 * np.linalg.norm(jacobian) * np.linalg.norm(residual)
+        inside = found > 1e-12 * found.max()
+        assert np.abs(descent[inside]).max(initial=0.0) < largest
+        assert descent[~inside].max(initial=0.0) < largest

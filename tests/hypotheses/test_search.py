@@ -27,7 +27,7 @@ from orthocal.assessment.words.anomalies import describe_anomalies
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
-from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
+from orthocal.hypotheses.families.unit_and_sign import decimal_steps, wrong_units_and_signs
 from orthocal.hypotheses.families.wrong_readings import wrong_readings
 from orthocal.hypotheses.family_scores import CLEAR_LOG_BAYES
 from orthocal.hypotheses.hypothesis import MAX_DENSE_COLUMNS, Rows, to_dense
@@ -374,3 +374,11 @@ def test_similar_hypotheses_that_are_clear_together_are_reported(seed, name):
     (anomaly,) = find_anomalies(session.with_values(made.values)).found
     assert anomaly.log_evidence < CLEAR_LOG_BAYES
     assert any(is_named(e, made) for e in (anomaly.explanation, *anomaly.alternatives))
+
+
+def test_decimal_steps_are_those_of_the_written_numbers():
+    """The numbers are in mm, and read from text."""
+    written = {"1.001": 1e-3, "2.001": 1e-3, "12.001": 1e-3, "0.9999": 1e-4, "-0.25": 1e-2}
+    written |= {"3": 1.0, "0.1000": 0.1, "12.34567": 1e-5, "0": 1.0}
+    steps = decimal_steps(np.array([float(text) * MM for text in written])) / MM
+    assert steps == pytest.approx(list(written.values()), rel=1e-9)

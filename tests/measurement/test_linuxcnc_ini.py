@@ -361,7 +361,12 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
     assert "instead of" not in done.stderr
     assert f"The lines of {ini} contain them: enter these lines" in done.stdout
-    assert "HOME_OFFSET" not in done.stdout
+    assert "as HOME_OFFSET" not in done.stdout
+    # a controller that does not compensate it
+    assert "what it compensates, 0 for none, and its HOME_OFFSET" in " ".join(done.stdout.split())
+    file = folder / "second/session.yaml"
+    file.write_text(re.sub(r"backlash_mm: \[.*?\]", "backlash_mm: [0, 0, 0]", file.read_text()))
+    assert [trim.backlash for trim in load_plan(file.parent).compensation] == [0.0] * 3
 
 
 def program_joints(folder):

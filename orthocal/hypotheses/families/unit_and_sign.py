@@ -29,11 +29,11 @@ finely; such numbers were computed."""
 READ_FRACTION = 0.1
 """Smallest part of a gauge's division that is read."""
 
-MAX_DECIMALS = 9
+MAX_DECIMALS = 8
 """Largest number of decimals, in mm, of a step."""
 
-STEP_TOLERANCE = 1e-3
-"""Largest distance of a number from a multiple of the step, in steps."""
+STEP_TOLERANCE = 1e-5
+"""Largest distance of a number from a multiple of the step, in steps: rounding errors."""
 
 MAX_PAIRED_SETUPS = 24
 """Number of setups of a session above which pairs of setups are not tested."""
@@ -139,8 +139,8 @@ def _scaled(
 ) -> Family:
     """Family of groups multiplied by each factor after which the decimal step is plausible.
 
-    The step is compared with the largest noise of the gauges of a group. Factors below 1 are not
-    tested: they make the step finer.
+    The step is compared with the largest noise of the gauges of a group. With factors below 1 any
+    step is plausible: they make it finer.
     """
     of_rows = decimal_steps(rows.values)
     noise_of_rows = np.array([rows.sigma(i) for i in range(rows.count)])
@@ -167,7 +167,7 @@ def _dimensions(rows: Rows, group: Explanation) -> int:
 def decimal_steps(values: Array) -> Array:
     """Largest decimal step (1 mm, 0.1 mm, …) that divides each value, [m]; 0 if there is none."""
     result = np.zeros(len(values))
-    for decimals in reversed(range(MAX_DECIMALS)):
+    for decimals in reversed(range(MAX_DECIMALS + 1)):
         step = 10.0**-decimals * MM
         integers = np.round(values / step)
         divides = np.abs(values / step - integers) < STEP_TOLERANCE
