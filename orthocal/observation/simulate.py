@@ -28,11 +28,15 @@ from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import Parameter, ParameterSet, split_assignment
 from orthocal.robot.redundant import require_independent_rows
-from orthocal.session.session import Reading, Session
+from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import MM, to_mm
 
 LARGEST_ZERO = 0.2e-3
 """Limit of the uniform distribution of the first reading of a setup, [m]."""
+
+SPARE_NOISE = 5.0
+"""Distance of readings from the ends of the range for which an operator sets the dial more exactly,
+in standard deviations of their noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,8 +180,9 @@ def _require_readable(plan: Session, rows: Array) -> None:
             limit = limits[0] if value < limits[0] else limits[1]
             raise SessionError(
                 f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
-                f"range ends at {limit / MM:g} mm. Such a machine needs a gauge with more range, "
-                "or offsets that are entered before; use smaller errors or another seed",
+                f"range ends at {limit / MM:g} mm. Such a machine needs a gauge with more range"
+                f"{', or offsets that are entered before' * (not plan.active_offsets.any())}; use "
+                "smaller errors or another seed",
                 where=plan.locate_gauge_key(gauge_name, "range_mm"),
             )
 
@@ -219,9 +224,11 @@ def show_readings(
     for i, (name, setup) in enumerate(plan.setups.items()):
         if setup.zero == "known":
             continue
-        zeros[name] = gauges[i].middle - float(entries[observations.setup == i][:1].sum())
+        of_setup = entries[observations.setup == i]
+        first = float(of_setup[:1].sum())
+        zeros[name] = gauges[i].middle - first
         if not exact:
-            zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
+            zeros[name] += _draw_setting(of_setup - first, gauges[i], noise[i], rng)
     entries = entries + np.array(list(zeros.values()))[observations.setup]
     if not exact:
         entries = entries + noise[observations.setup] * rng.normal(size=observations.size)
@@ -231,6 +238,23 @@ def show_readings(
                 divisions = np.round(entries[of_setup] / gauge.resolution)
                 entries[of_setup] = divisions * gauge.resolution
     return entries, zeros
+
+
+def _draw_setting(deviations: Array, gauge: Gauge, sigma: float, rng: np.random.Generator) -> float:
+    """Reading of the first posture of a setup, from the middle of the gauge's range, [m].
+
+    If all readings can be within the range, it is so small that they are.
+
+    Args:
+        deviations: Exact readings minus the first one, shape (n,), [m].
+        gauge: The gauge.
+        sigma: Standard deviation of a reading, [m].
+        rng: Generator.
+    """
+    setting = float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO))
+    half = gauge.half_range - SPARE_NOISE * sigma
+    low, high = -half - min(deviations, default=0.0), half - max(deviations, default=0.0)
+    return round(float(np.clip(setting, low, high)) if low <= 0.0 <= high else setting, 6)
 
 
 def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:

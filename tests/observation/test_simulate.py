@@ -195,6 +195,17 @@ def test_readings_beyond_the_gauge_are_refused(plan):
         simulate_session(plan, {"x_slide.offset": 25e-3, "y_slide.offset": -25e-3})
 
 
+def test_a_dial_is_set_so_that_all_readings_are_within_its_range(plan):
+    """The range is 0.1 mm larger than the readings need; a usual setting is within 0.2 mm of 0."""
+    exact_plan = predict_readings(plan, ERRORS)
+    setups = [r.setup for r in plan.readings]
+    apart = exact_plan - [exact_plan[setups.index(name)] for name in setups]
+    half = np.abs(apart).max() + 0.1e-3
+    narrow = plan.with_gauge(replace(plan.gauge, range=(-half, half)))
+    for seed in range(20):
+        assert np.abs(simulate_session(narrow, ERRORS, seed=seed).session.values).max() <= half
+
+
 def test_a_dial_is_set_to_the_middle_of_its_range(plan):
     """A dial of 0 to 10 mm is set to 5 mm, as the sheet says; ±5 mm remain to either side."""
     dials = [replace(plan.gauge, range=limits) for limits in ((-5e-3, 5e-3), (0.0, 10e-3))]

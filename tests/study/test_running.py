@@ -324,7 +324,7 @@ def sent(study):
     """The study in the process of a worker, which has loaded no robot."""
     data = pickle.dumps(study)
     robot_loading._build_robot.cache_clear()
-    loading._add_parameters.cache_clear()
+    loading._add_loaded_parameters.cache_clear()
     prepare_once.cache_clear()
     return pickle.loads(data)
 
