@@ -175,9 +175,11 @@ def _read_joints(
             such an option is stated.
     """
     from orthocal.effects.compensation import JointTrim
+    from orthocal.export.formats import require_format
     from orthocal.export.linuxcnc.entered_lines import compare_joints, require_same_homes
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
+    require_format(to)
     if to != "linuxcnc":
         raise ParameterError("is an option of --to linuxcnc only", where="--ini")
     joints = read_controller_joints(path, calibration.robot)

@@ -95,6 +95,16 @@ OF_OFFSETS = ("table", "linuxcnc")
 """Formats for a controller with offsets of the drives."""
 
 
+def require_format(to: str) -> None:
+    """Refuse a name that is no format.
+
+    Raises:
+        ParameterError: If the format is unknown; lists the formats.
+    """
+    if to not in FORMATS:
+        raise ParameterError(f"found '{to}'; expected one of {', '.join(FORMATS)}", where="--to")
+
+
 def export_calibration(
     calibration: Calibration,
     to: str,
@@ -120,8 +130,7 @@ def export_calibration(
         ExportError: If the verdict is review or reject, or the machine does not reach the region of
             the format.
     """
-    if to not in FORMATS:
-        raise ParameterError(f"found '{to}'; expected one of {', '.join(FORMATS)}", where="--to")
+    require_format(to)
     if to in OF_OFFSETS:
         require_offsets(calibration, where="--to")
     if not anyway:

@@ -343,6 +343,7 @@ REFUSED = {
     "--within 1": "--within: is an option of a kinematics module, and the",
     "--to yaml --tool 0,0,0": "--tool: is an option of --to linuxcnc only",
     "--to yaml --ini a.ini": "--ini: is an option of --to linuxcnc only",
+    "--to linux --ini a.ini": "--to: found 'linux'; expected one of",
     "--to yaml --offsets": "--module or --offsets: is an option of --to linuxcnc only",
     "--module --payload 1": "--payload: found 1.0; no effect of the machine",
     "--payload 1": "--payload: is an option of a kinematics module, and the",

@@ -71,10 +71,12 @@ def larger_than_predicted(
     action = ""
     if refit is not None:
         if explains:
-            where = "other settings were active" if firmware else "a gauge was mounted elsewhere"
+            where = "a gauge was mounted elsewhere or other offsets were entered"
+            where = "other settings were active" if firmware else where
             cause = f"a reading is wrong, {where} than stated, or the machine has changed"
             repeat = f"Read setup {place.setup} again, which agrees least with the others"
             repeat = "Probe again" if firmware else f"{repeat}: {command}" if command else repeat
+            repeat = repeat if firmware else f"Check the entered offsets. {repeat}"
             action = f"{repeat}. Then validate again. If the deviations remain, "
             action += RECALIBRATE_PRINTER if firmware else RECALIBRATE
         else:
