@@ -22,6 +22,7 @@ from orthocal.units import MM
 if TYPE_CHECKING:
     from orthocal.arrays import Array
     from orthocal.effects.compensation import Compensation
+    from orthocal.kinematics.workspace import Workspace
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -232,6 +233,34 @@ class SharedOptions:
     """
 
 
+def _describe_excluded(
+    workspace: Workspace, robot: orthocal.Robot, axes: Sequence[tuple[float, float]], ini: Path
+) -> str:
+    """Note about axes whose soft limits exclude a part of the workspace; "" without any.
+
+    Args:
+        workspace: The workspace.
+        robot: The robot.
+        axes: MIN_LIMIT and MAX_LIMIT of X, Y and Z in tool coordinates, [m].
+        ini: The INI file.
+    """
+    from orthocal.assessment.wording import joined
+    from orthocal.output.sheet.soft_limits import ROUNDING
+    from orthocal.robot.model import require_tcp
+
+    excluded = [
+        f"[AXIS_{'XYZ'[c]}]"
+        for c, points in zip(require_tcp(robot).coordinates, workspace.points.T, strict=True)
+        if points.min() < axes[c][0] - ROUNDING or points.max() > axes[c][1] + ROUNDING
+    ]
+    if not excluded:
+        return ""
+    return (
+        f"{ini}: the soft limits of {joined(excluded)} exclude a part of the workspace. The "
+        "expected tool error counts all of it, unless --workspace-mm states a smaller one."
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerOptions:
     """Options about what the controller corrects during the measurement.
@@ -251,17 +280,25 @@ class ControllerOptions:
         equipment: orthocal.Equipment,
         robot: orthocal.Robot,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        workspace: Workspace | None = None,
     ) -> orthocal.Equipment:
         """Equipment whose postures are within the soft limits of the INI file.
+
+        A note names axes whose limits exclude a part of the workspace.
 
         Args:
             equipment: The equipment.
             robot: The robot.
             origin: Displayed tool coordinates in the origin of the world, [m].
+            workspace: The workspace; by default that of the robot.
 
         Raises:
             ParameterError: If the file does not fit the robot, or an axis leaves no room.
         """
+        import numpy as np
+
+        from orthocal.cli.printing import put_note
+        from orthocal.kinematics.reachable_box import find_workspace
         from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
         if self.ini is None:
@@ -271,7 +308,10 @@ class ControllerOptions:
             (low - shift, high - shift)
             for (low, high), shift in zip(joints.axis_limits, origin, strict=True)
         ]
-        return equipment.within_limits(robot, joints.limits, axes)
+        limited = equipment.within_limits(robot, joints.limits, axes)
+        if robot.commands_tool and np.isfinite(axes).any():
+            put_note(_describe_excluded(workspace or find_workspace(robot), robot, axes, self.ini))
+        return limited
 
     def read(self, robot: orthocal.Robot) -> Compensation | None:
         """Compensation of the controller; None without an option.

@@ -145,10 +145,10 @@ def _choose(
         raise ParameterError("found with --setups; expected one", where="--add")
     equipment, compensation = _read_equipment(options, robot, measured), controller.read(robot)
     origin = (0.0, 0.0, 0.0) if measured is None else measured.controller_origin
-    equipment = controller.limit(equipment, robot, origin)
     workspace = None
     if options.workspace_mm is not None:
         workspace = box_workspace(robot, read_workspace(options.workspace_mm, robot))
+    equipment = controller.limit(equipment, robot, origin, workspace)
     names = split_effects(options.effects)
     with errors_at("--effects"):
         robot = robot if names is None else with_effects(robot, names)

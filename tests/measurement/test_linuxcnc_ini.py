@@ -27,13 +27,16 @@ from orthocal import (
     write_session,
 )
 from orthocal.assessment.controller_entries import find_backlash
+from orthocal.cli.options import ControllerOptions
 from orthocal.cli.sheet import note_contradictions
 from orthocal.effects.compensation import JointTrim, compensates_alike, home_positions, with_homes
 from orthocal.effects.loading import with_effects
 from orthocal.export.linuxcnc import entered_lines
+from orthocal.kinematics.workspace import cube
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.output.text.answer import render_answer
 from orthocal.output.text.layout import to_text
+from orthocal.planning.equipment import Equipment
 from orthocal.units import DEG
 
 MM = 1e-3
@@ -107,6 +110,21 @@ def test_limits_that_limit_nothing_are_infinite(folder, orthoglide):
     (folder / "machine.ini").write_text((INI + axes).replace("= 70", "= -70"))
     with pytest.raises(ParameterError, match=r"\[AXIS_X\]: MIN_LIMIT is -60 mm, not below MAX"):
         read_controller_joints(folder / "machine.ini", orthoglide)
+
+
+@pytest.mark.parametrize(
+    ("least", "side", "noted"), [(-60, None, True), (-61, None, False), (-60, 0.05, False)]
+)
+def test_limits_that_exclude_a_part_of_the_workspace_are_noted(
+    folder, orthoglide, capsys, least, side, noted
+):
+    """The workspace is ±60 mm in coordinates that are 1 mm less than the displayed ones."""
+    (folder / "machine.ini").write_text(f"{INI}[AXIS_X]\nMIN_LIMIT = {least + 1.5}\n")
+    workspace = None if side is None else cube(orthoglide, half_side=side)
+    options = ControllerOptions(ini=folder / "machine.ini")
+    options.limit(Equipment(), orthoglide, (0.001, 0.0, 0.0), workspace)
+    note = " ".join(capsys.readouterr().err.split())
+    assert ("the soft limits of [AXIS_X] exclude a part of the workspace" in note) is noted
 
 
 @pytest.mark.parametrize(("effects", "noted"), [(["backlash"], True), ([], False)])
