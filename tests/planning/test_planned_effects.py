@@ -154,6 +154,12 @@ def test_programs_of_a_plan_are_within_the_soft_limits(machine):
     assert re.search(r"(?m)^  AXIS_[XYZ], MAX_LIMIT", beyond)
     assert "MAX_LIMIT" in describe_beyond_limits(free, joints, file="machine.ini")
     assert describe_beyond_limits(limited, joints, axes, file="machine.ini") == ""
+    # no change of postures helps if the programs begin beyond a limit
+    beyond = describe_beyond_limits(free, [(0.32, 1.0), *joints[1:]], file="machine.ini")
+    assert re.search(
+        r"(?m)^  JOINT_0 .*: the mechanical zero, where every program begins, reaches 310\.250 mm$",
+        beyond,
+    )
     # the farthest displayed coordinates are those of the program's lines
     origin = (0.001, 0.002, 0.003)
     shifted = replace(free, controller_origin=origin)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.guidance import shown_joints, shown_tool
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.stops import Stop
@@ -17,6 +18,9 @@ from orthocal.units import DRIVE_UNITS, Unit, format_fixed
 
 ROUNDING = 1e-6
 """Largest excess over a limit that is ignored, [m, rad]: limits are written to 1 µm."""
+
+AT_ZERO = ("the mechanical zero,", "where every program begins,")
+"""Named in place of setup and posture if the start of programs is beyond a limit."""
 
 MOST_PLACES = 4
 """Largest number of postures that are named for a limit."""
@@ -60,7 +64,8 @@ def describe_beyond_limits(
     head = f"{file}: the controller refuses motions of this plan, which exceed its soft limits."
     remedy = (
         "If the machine can go there, widen the limit. Otherwise change these postures in "
-        "session.yaml or their approach in readings.csv, and run `orthocal sheet --ini`."
+        "session.yaml or their approach in readings.csv, and run `orthocal sheet --ini`. The "
+        "mechanical zero must be within the limits."
     )
     return "\n".join([head, *lines, remedy])
 
@@ -70,6 +75,8 @@ def _find_beyond(
 ) -> dict[tuple[int, str, float], dict[tuple[str, str], float]]:
     """Farthest coordinate of a joint or an axis on the way to each posture beyond a limit.
 
+    If the mechanical zero is beyond a limit, it is named alone.
+
     Args:
         session: The plan.
         limits: Limits of the joints, and of the axes after them if they count, [m, rad].
@@ -78,20 +85,33 @@ def _find_beyond(
         Coordinates, [m, rad], by (index of the limits, key of the limit, limit), then by setup and
         posture.
     """
-    beyond: dict[tuple[int, str, float], dict[tuple[str, str], float]] = {}
+    paths = [] if session.firmware is not None else [(AT_ZERO, _shown_at_zero(session))]
     for motion in plan_motion(one_row_per_point(session)):
         alignment = () if motion.alignment is None else (motion.alignment,)
-        for stop in (*alignment, *motion.stops):
-            shown = _shown_on_path(session, stop)
-            for i, ((low, high), coordinates) in enumerate(zip(limits, shown, strict=False)):
-                for key, limit, sign in (("MIN_LIMIT", low, -1.0), ("MAX_LIMIT", high, 1.0)):
-                    farthest = (sign * coordinates).max()
-                    if farthest > sign * limit + ROUNDING:
-                        places = beyond.setdefault((i, key, limit), {})
-                        place = motion.setup, stop.posture
-                        before = places.get(place, sign * farthest)
-                        places[place] = sign * float(max(farthest, sign * before))
-    return beyond
+        paths += [
+            ((motion.setup, stop.posture), _shown_on_path(session, stop))
+            for stop in (*alignment, *motion.stops)
+        ]
+    beyond: dict[tuple[int, str, float], dict[tuple[str, str], float]] = {}
+    for place, shown in paths:
+        for i, ((low, high), coordinates) in enumerate(zip(limits, shown, strict=False)):
+            for key, limit, sign in (("MIN_LIMIT", low, -1.0), ("MAX_LIMIT", high, 1.0)):
+                farthest = (sign * coordinates).max()
+                places = beyond.setdefault((i, key, limit), {})
+                if farthest > sign * limit + ROUNDING and AT_ZERO not in places:
+                    before = places.get(place, sign * farthest)
+                    places[place] = sign * float(max(farthest, sign * before))
+    return {limit: places for limit, places in beyond.items() if places}
+
+
+def _shown_at_zero(session: Session) -> list[Array]:
+    """Coordinates that the controller displays in the mechanical zero; as `_shown_on_path`."""
+    robot = session.robot
+    shown = list(shown_joints(robot, robot.drive_zero[None]).T)
+    if not robot.commands_tool:
+        return shown
+    origin = np.array(session.controller_origin)[list(require_tcp(robot).coordinates)]
+    return [*shown, *(tool_at_zero(robot) + origin)[:, None]]
 
 
 def _shown_on_path(session: Session, stop: Stop) -> list[Array]:
