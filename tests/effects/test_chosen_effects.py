@@ -69,11 +69,12 @@ def test_tolerances_stay_with_a_choice_of_effects(plan):
         with_effects(stated, ["thermal"])
 
 
-def test_choices_of_effects_leave_loaded_robots_in_memory(orthoglide):
+def test_choices_of_effects_leave_loaded_robots_in_memory():
+    robot = load_robot("orthoglide")
     for number in range(1, 11):
-        with_effects(orthoglide.with_tolerances({"*.offset_mm": number}), ["backlash"])
-        with_adjustments(orthoglide.with_tolerances({"*.offset_mm": number}))
-    assert load_robot("orthoglide") is orthoglide
+        with_effects(robot.with_tolerances({"*.offset_mm": number}), ["backlash"])
+        with_adjustments(robot.with_tolerances({"*.offset_mm": number}))
+    assert load_robot("orthoglide") is robot
 
 
 def test_an_unknown_effect_and_a_missing_key_are_refused(orthoglide):

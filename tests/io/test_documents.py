@@ -123,7 +123,7 @@ def change(document, keys, value):
         (["residuals", 0, "minus"], "", "residuals[0].minus: found ''"),
         (["residuals", 0, "line"], 10**30, "expected less than or equal to 1000000000"),
         (["identifiability", "singular_values", 2], 0.0, "only 2 singular values are above 0"),
-        (["identifiability", "singular_values", 2], -1.0, "expected positive numbers"),
+        (["identifiability", "singular_values", 2], -1.0, "expected numbers of at least 0"),
         (["identifiability", "singular_values", 0], 0.0, "the largest first"),
         (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
         (["model_covariance"], [], "covariance: expected 3 × 3 numbers"),

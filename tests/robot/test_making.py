@@ -174,7 +174,7 @@ def test_a_description_without_a_place_for_a_size_is_named(tmp_path):
             "travel from 120 to 650 mm; legs of 310.25 mm reach 31.025 to 589.475",
         ),
         ({"attachment": -0.01}, "hinges -10 mm from the tool centre point; expected 0"),
-        ({"rods_apart": 0.01}, "rods of radius 5.5 mm, 10 mm apart; expected them to clear"),
+        ({"rods_apart": 0.01}, "rods of radius 5.5 mm, 10 mm apart; expected a radius above 0"),
         ({"rod_radius": 0.0}, "rods of radius 0 mm"),
         ({"leg": float("nan")}, "legs of nan mm"),
     ],

@@ -27,7 +27,7 @@ from orthocal.export.linuxcnc.drive_compensation import (
     round_backlash,
 )
 from orthocal.export.linuxcnc.entered_lines import require_same_homes
-from orthocal.export.linuxcnc.home_offsets import find_homes
+from orthocal.export.linuxcnc.home_offsets import JointHome, find_homes
 from orthocal.export.linuxcnc.instructions import (
     write_home_lines,
     write_home_page,
@@ -163,6 +163,18 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         page = write_home_page(calibration, homes, own_limits=own_limits)
         lines = write_home_lines(calibration, homes)
         return {"README.md": page, "joints.ini": lines, **tables}
+    return {**_write_module(calibration, homes, options), **tables}
+
+
+def _write_module(
+    calibration: Calibration, homes: Sequence[JointHome], options: ExportOptions
+) -> dict[str, str]:
+    """Texts of a kinematics module by file name.
+
+    Raises:
+        ExportError: If no module meets the tolerance.
+        ParameterError: If the region of the module is beyond the limits of an axis.
+    """
     approximation = approximate(
         calibration,
         within=DEFAULT_TOLERANCE if options.within is None else options.within,
@@ -170,15 +182,14 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         half_side=options.half_side,
         payload=options.payload,
     )
-    limits = _limit_axes(approximation, options.axis_limits, calibration.session.controller_origin)
+    stated = options.axis_limits
+    limits = _limit_axes(approximation, stated, calibration.session.controller_origin)
+    own_limits = any(math.isfinite(limit) for axis in stated or () for limit in axis)
     return {
-        "README.md": write_module_page(
-            calibration, approximation, homes, own_limits=options.axis_limits is not None
-        ),
+        "README.md": write_module_page(calibration, approximation, homes, own_limits=own_limits),
         "kinematics.ini": write_module_lines(approximation, homes, limits),
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
-        **tables,
     }
 
 
