@@ -420,7 +420,7 @@ class LoopClosure:
 
     @cached_property
     def _closing_freely(self) -> System:
-        """Those of `_closing`, solved by the shortest steps."""
+        """Equations of `_closing`, solved by the shortest steps."""
         system = copy.copy(self._closing)
         system.shortest = True
         return system
