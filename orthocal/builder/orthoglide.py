@@ -78,6 +78,8 @@ class SlidingLegs(Dimensions):
             return problem
         leg, (lower, upper) = self.leg, self.travel
         travel = f"travel from {in_mm(lower)} to {in_mm(upper)} mm"
+        if lower >= upper:
+            return "travel", f"{travel}; expected the lowest coordinate first"
         if not lower < leg < upper:
             return "travel", (
                 f"{travel} does not include {in_mm(leg)} mm, the leg length, where the mechanical "

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arguments import require_kind, require_numbers
+from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Mask
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.effects.compensation import displace_drives
@@ -37,7 +37,7 @@ class Machine:
 
     def __post_init__(self) -> None:
         require_kind(self.robot, Robot, expected="a Robot, such as load_robot(...)")
-        require_numbers(self.errors, argument="errors")
+        self.robot.parameters.expand(self.errors)  # refuses unknown names and wrong values
         object.__setattr__(self, "errors", dict(self.errors))
 
     def forward(

@@ -208,7 +208,7 @@ def _describe_entries(
             "states no offsets (`controller`)."
         )
     if ini is not None:
-        text += f" The lines of {ini} contain them: enter these lines, unless you have already."
+        text += f" The lines of {ini} contain them: enter these lines if they are not active yet."
     else:
         text += f" Do not type them as HOME_OFFSET: {_describe_conversion(new, calibration, path)}"
         if down := [d.name for d in drives if d.direction < 0]:
@@ -224,8 +224,8 @@ def _describe_entries(
             f"{', and its HOME_OFFSET' * (home_positions(new.compensation) is not None)}."
         )
     return (
-        f"{text}\nThen home, measure and compare. Also name all other sessions that were measured "
-        "with these offsets:"
+        f"{text}\nThen home, measure and compare. If other sessions were measured with these "
+        "offsets, name them, too:"
     )
 
 

@@ -15,6 +15,7 @@ from tolerances import CLOSED_FORM, KINEMATICS
 
 from orthocal import (
     Choice,
+    Machine,
     calibrate,
     load_calibration,
     parameter_table,
@@ -25,7 +26,7 @@ from orthocal import (
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, calibration_json, write_calibration
 from orthocal.calibration.identify import identify
-from orthocal.errors import ClosureError, OrthocalError
+from orthocal.errors import ClosureError, OrthocalError, ParameterError
 from orthocal.statistics.chance import COVERAGE, confidence_factor
 
 QUICK = {"solver": "variable-projection"}
@@ -234,6 +235,11 @@ def test_coordinates_beyond_the_travel_are_refused():
         machine.forward([[0.31, 0.31, 0.391], [0.391, 0.31, 0.31]])
     with pytest.raises(ValueError, match="found 1 names for 2 rows"):
         machine.forward([[0.31, 0.31, 0.31]] * 2, names=["a"])
+
+
+def test_unknown_errors_of_a_machine_are_refused(orthoglide):
+    with pytest.raises(ParameterError, match=r"x_slide\.offsett.*x_slide\.offset"):
+        Machine(orthoglide, {"x_slide.offsett": 1e-3})
 
 
 def test_readings_are_not_overwritten_by_results(tmp_path):

@@ -261,6 +261,7 @@ def test_the_packaged_orthoglide_is_one_of_the_kinds(tmp_path, orthoglide):
         (Orthoglide(leg=250.0), "leg", "legs of 250000 mm; expected 20 to 5000 mm"),
         (Orthoglide(leg=float("nan")), "leg", "legs of nan mm"),
         (Orthoglide(leg=0.4), "travel", "does not include 400 mm, the leg length"),
+        (Orthoglide(travel=(0.39, 0.12)), "travel", "390 to 120 mm; expected the lowest"),
         (Orthoglide(travel=(0.12, 0.65)), "travel", "legs of 310.25 mm reach 31.025 to 589.475"),
         (Orthoglide(attachment=-0.01), "attachment", "hinges -10 mm from the tool centre point"),
         (Orthoglide(rods_apart=0.01), "rod_radius", "rods of radius 5.5 mm, 10 mm apart"),

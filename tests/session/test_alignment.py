@@ -301,5 +301,6 @@ def test_a_ball_is_centred_on_the_rod_in_its_alignment_posture(tmp_path):
 def test_other_tips_are_where_the_mechanical_zero_has_the_rod(tmp_path, keys):
     plan, found = displacements(tmp_path, **keys)
     assert set(found.values()) == {(0.0, 0.0, 0.0)}
-    copy = load_session(write_session(plan.with_values([0.0] * 4), tmp_path / "copy"))
+    copy = load_session(write_session(plan.with_values([-0.0] * 4), tmp_path / "copy"))
+    assert "-0" not in (tmp_path / "copy" / "readings.csv").read_text()
     assert {s.sensor.beside for s in copy.setups.values()} == {(0.0, 0.0, 0.0)}

@@ -247,8 +247,8 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
         )
     changes = joined([f"{plain(size)} {unit}" for unit, size in sizes.items()], "or")
     text = (
-        f"No change between the sessions was found. One offset that changed by {changes} between "
-        "them would have been detected. `orthocal validate` detects smaller deviations."
+        f"No change between the sessions was found. A change of one offset by {changes} "
+        "would have been detected. `orthocal validate` detects smaller deviations."
     )
     if undetectable:
         text += f" A change of {joined(tuple(undetectable), 'or')} would not have been."

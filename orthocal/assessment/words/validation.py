@@ -148,7 +148,10 @@ def further_change(entries: Sequence[ControllerEntry]) -> Finding:
         for e in entries
         if e.active is not None
     ]
-    text = "The new readings still improve the offsets together."
+    text = (
+        "The new readings improve the offsets further: each by less than its uncertainty, but all "
+        "together significantly."
+    )
     if changes:
         noun = "an offset" if len(changes) == 1 else "offsets"
         text = f"The new readings still improve {noun}: {joined(changes)}."

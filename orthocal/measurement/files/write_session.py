@@ -352,7 +352,7 @@ def readings_table(
         cells = point_cells(group, setups, decimals) if is_point and not blank else {}
         required |= set(REQUIRED_OF_POINTS if is_point else REQUIRED)
         if r.is_read and not blank and not is_point:
-            value = trim_zeros(f"{r.value / MM:.{decimals}f}")
+            value = trim_zeros(f"{round(r.value / MM, decimals) + 0.0:.{decimals}f}")
         if conditions.temperature is not None:
             temperature = f"{conditions.temperature:.12g}"
         row = RawReading(

@@ -46,8 +46,8 @@ def compare_closing(session: Session, motion: SetupMotion) -> str:
     usual = f"{show_length(largest)} mm" if largest else "three steps of the dial"
     reading = "0" if first.role == "subtracted" else f"that of line {last.repeats}"
     return (
-        f"Compare the last reading with {reading}: posture and approach are the same. If they "
-        f"differ by more than {usual}, read this setup again: the gauge or the machine was "
+        f"Compare the closing (last) reading with {reading}: posture and approach are the same. If "
+        f"they differ by more than {usual}, read this setup again: the gauge or the machine was "
         "displaced. "
     )
 

@@ -82,7 +82,7 @@ STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "r
 LONGEST_LINE = 150
 """Characters of a line with names from files, in the short answer."""
 
-CONVERTED = "`orthocal export --offsets` converts it to HOME_OFFSET."
+CONVERTED = "`orthocal export` converts it to HOME_OFFSET."
 """How an offset becomes a value of the controller."""
 
 NEW_NOTE = f"new: total offset, which replaces now. {CONVERTED}"
@@ -263,13 +263,13 @@ def _next_step(
     words = "nothing to enter. After a crash or a change of the machine measure again."
     if changes:
         words = (
-            f"enter {joined(changes)} (for LinuxCNC: `orthocal export`), home the machine and "
-            "measure again."
+            f"enter {joined(changes)} (the first command writes the lines for LinuxCNC), home the "
+            "machine and measure again."
         )
     in_linuxcnc = bool(changes) and home_positions(calibration.session.compensation) is not None
     ini = f" --ini {quote_path(f'{home}/joints.ini')}" if in_linuxcnc else ""
     return words, (
-        *([offsets] if in_linuxcnc else []),
+        *([offsets] if changes else []),
         f"orthocal again {directory}{ini} --out {new}",
         f"orthocal record {new}",
         f"orthocal validate {directory} {new}",
