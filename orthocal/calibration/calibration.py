@@ -109,6 +109,10 @@ class Calibration(CalibrationRecord):
     path: Path | None = None
     """File from which it was loaded."""
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.residuals)} readings, {len(self.free)} free errors"
+        return f"<Calibration of {self.robot.name}: model {self.model!r}, {counts}>"
+
     def __iter__(self) -> Iterator[ParameterEstimate]:
         return iter(self.parameters)
 

@@ -254,6 +254,10 @@ class Robot:
     adjusted: bool = False
     """True if placements depend on the mechanical adjustments of each session."""
 
+    def __repr__(self) -> str:
+        drives = ", ".join(d.name for d in self.drives)
+        return f"<Robot {self.name}: drives {drives}; {len(self.parameters)} error parameters>"
+
     def __getstate__(self) -> dict[str, Any]:
         """State for pickle, without the constraint models, which Pinocchio does not pickle."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "constraints"}

@@ -303,6 +303,10 @@ class Session:
     seed: int | None = None
     """Seed of simulated readings; None for measured readings."""
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.readings)} readings in {len(self.setups)} setups"
+        return f"<Session of {self.robot.name}: {counts}>"
+
     @property
     def labels(self) -> tuple[str, ...]:
         """Label of the session of each setup, shape (n_setups,); "" unless sessions were joined."""

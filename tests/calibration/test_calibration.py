@@ -242,6 +242,14 @@ def test_unknown_errors_of_a_machine_are_refused(orthoglide):
         Machine(orthoglide, {"x_slide.offsett": 1e-3})
 
 
+def test_records_are_shown_in_a_line(result):
+    """As the last line of a notebook's cell shows them."""
+    shown = [repr(record) for record in (result, session_of("raw-cycles"), result.robot)]
+    words = ("model 'offsets', 54 readings", "54 readings in 6 setups", "x_slide, y_slide, z_slide")
+    assert all(word in text for word, text in zip(words, shown, strict=True))
+    assert max(map(len, shown)) < 100
+
+
 def test_readings_are_not_overwritten_by_results(tmp_path):
     result = calibrated("raw-cycles")
     readings = tmp_path / "readings.csv"
