@@ -57,6 +57,9 @@ group."""
 STOPS = frozenset({0.0, 1.0, 2.0, 30.0, 60.0})
 """M-words that take effect after the motion of their line."""
 
+COORDINATES = frozenset("XYZIJKR")
+"""Letters of points, centres and radii: a line with one of them is a motion."""
+
 ENDS = frozenset({2.0, 30.0})
 """M-words that end the program."""
 
@@ -297,7 +300,7 @@ class Interpreter:
                 self.modes = replace(self.modes, feed=words["F"])
         if not _ARGUMENTS.isdisjoint(words):
             self._check_arguments(words, codes)
-        moves = not _COORDINATES.isdisjoint(words)
+        moves = not COORDINATES.isdisjoint(words)
         if moves and dwell:
             raise GcodeError("found a dwell and coordinates; expected one of them")
         step = self._move(line, words) if moves else Step(line, self.modes, self.offset)
@@ -410,7 +413,7 @@ class Interpreter:
         if "P" in words or "Q" in words:
             codes_with_p = {("G", 4.0), ("G", 64.0), *(("M", m) for m in P_WORDS)}
             belongs_to_code = any((w.letter, w.value) in codes_with_p for w in codes)
-            belongs_to_arc = is_arc and not _COORDINATES.isdisjoint(words)
+            belongs_to_arc = is_arc and not COORDINATES.isdisjoint(words)
             if not (belongs_to_code or (belongs_to_arc and "Q" not in words)):
                 raise GcodeError("found P or Q without a word that needs it")
             if belongs_to_code and belongs_to_arc:
@@ -576,6 +579,5 @@ def _tenfold(value: float) -> float:
 
 
 _NO_COORDINATES = (None, None, None)
-_COORDINATES = frozenset("XYZIJKR")
 _ARGUMENTS = frozenset("PQIJKR")
 _ACCEPTED = frozenset("NFSTPQIJKR")

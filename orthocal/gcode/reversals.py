@@ -12,7 +12,8 @@ from orthocal.arrays import Array, Indices, Mask
 from orthocal.gcode.path import Paths
 
 LARGEST_ANGLE = math.pi / 8.0
-"""Largest angle of a part of an arc, in which a drive reverses at most once, [rad]."""
+"""Largest angle of a part of an arc, [rad]. A drive reverses about once in half a turn of an arc,
+so that the ends of a part of a sixteenth of a turn show each reversal."""
 
 STEP = 1e-4
 """Step of the parameter of a motion for the direction of a drive. Reversals nearer to its ends are
@@ -66,9 +67,9 @@ class Parts:
 
     motion: Indices
     """Motion of each part, shape (k,)."""
-    first: Array
-    """Parameter of the start of each part on its motion, shape (k,)."""
-    last: Array
+    start: Array
+    """Parameter of the start of each part on its motion, from 0 to 1, shape (k,)."""
+    end: Array
     """Parameter of the end of each part on its motion, shape (k,)."""
     sides: Array
     """Sides of the drives on each part, shape (k, n_drives)."""
@@ -84,13 +85,11 @@ def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
     counts = np.maximum(np.ceil(np.abs(paths.angle[:, 1]) / LARGEST_ANGLE), 1.0).astype(np.int64)
     motion = np.repeat(np.arange(len(counts)), counts)
     number = np.arange(motion.size) - np.repeat(np.cumsum(counts) - counts, counts)
-    first, last = number / counts[motion], (number + 1.0) / counts[motion]
-    starts = np.column_stack([motion, first])
-    reversals = _find_reversals(paths, sides, motion, first, last)
-    starts = np.unique(np.vstack([starts, reversals]), axis=0)
-    motion, first = starts[:, 0].astype(np.int64), starts[:, 1]
-    last = _part_ends(motion, first)
-    begins, ends = (sides.drives(paths.points(motion, t)) for t in (first, last))
+    start, end = number / counts[motion], (number + 1.0) / counts[motion]
+    reversals = _find_reversals(paths, sides, motion, start, end)
+    divisions = np.unique(np.vstack([np.column_stack([motion, start]), reversals]), axis=0)
+    motion, start = divisions[:, 0].astype(np.int64), divisions[:, 1]
+    begins, ends = (sides.drives(paths.points(motion, t)) for t in (start, _ends(motion, start)))
     followed = [
         _follow_drive(*of_drive)
         for of_drive in zip(begins.T, ends.T, sides.current, sides.farthest, strict=True)
@@ -98,13 +97,13 @@ def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
     part_sides = np.column_stack([of_parts for of_parts, _ in followed])
     reverses = (part_sides != np.vstack([sides.current, part_sides[:-1]])).any(axis=1)
     sides.current, sides.farthest = part_sides[-1], np.array([far for _, far in followed])
-    is_start = (first == 0.0) | reverses  # parts without a reversal belong to the previous part
-    motion, first = motion[is_start], first[is_start]
+    is_start = (start == 0.0) | reverses  # parts without a reversal belong to the previous part
+    motion, start = motion[is_start], start[is_start]
     bounds = np.cumsum(np.bincount(motion, minlength=len(counts))).tolist()
     return Parts(
         motion,
-        first,
-        _part_ends(motion, first),
+        start,
+        _ends(motion, start),
         part_sides[is_start],
         reverses[is_start],
         [0, *bounds],
@@ -138,34 +137,32 @@ def _follow_drive(begins: Array, ends: Array, side: float, farthest: float) -> t
     return part_sides, farthest
 
 
-def _part_ends(motion: Indices, first: Array) -> Array:
+def _ends(motion: Indices, start: Array) -> Array:
     """Parameters of the ends of parts: the start of the next part of the motion, or 1."""
     is_followed = np.append(motion[1:] == motion[:-1], False)
-    return np.where(is_followed, np.append(first[1:], 1.0), 1.0)
+    return np.where(is_followed, np.append(start[1:], 1.0), 1.0)
 
 
-def _find_reversals(
-    paths: Paths, sides: Sides, motion: Indices, first: Array, last: Array
-) -> Array:
+def _find_reversals(paths: Paths, sides: Sides, motion: Indices, start: Array, end: Array) -> Array:
     """Motions and parameters at which a drive reverses within short parts, shape (k, 2).
 
     Args:
         paths: Curves of the motions.
         sides: Sides of the drives.
         motion: Motion of each part, shape (n,).
-        first: Parameter of the start of each part, shape (n,).
-        last: Parameter of the end of each part, shape (n,).
+        start: Parameter of the start of each part, shape (n,).
+        end: Parameter of the end of each part, shape (n,).
     """
 
     def direction(curve: Indices, t: Array) -> Array:
         """Changes of the drive coordinates about parameters, shape (n, n_drives)."""
         low, high = np.clip(t - STEP, 0.0, 1.0), np.clip(t + STEP, 0.0, 1.0)
         change = sides.drives(paths.points(curve, high)) - sides.drives(paths.points(curve, low))
-        return np.asarray(np.nan_to_num(change))
+        return np.asarray(np.nan_to_num(change))  # out of reach: no reversal; it is refused later
 
-    begins, ends = direction(motion, first), direction(motion, last)
+    begins, ends = direction(motion, start), direction(motion, end)
     parts, drives = np.nonzero(begins * ends < 0.0)
-    low, high = first[parts], last[parts]
+    low, high = start[parts], end[parts]
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         change = direction(motion[parts], middle)[np.arange(parts.size), drives]

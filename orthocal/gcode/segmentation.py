@@ -100,7 +100,7 @@ def segment_motions(
     if sides is None or not len(paths.base):
         return _segment(paths, lambda points, _: correct(points), tolerance)
     reversals = split_at_reversals(paths, sides)
-    parts = paths.parts(reversals.motion, reversals.first, reversals.last)
+    parts = paths.parts(reversals.motion, reversals.start, reversals.end)
 
     def correct_on_sides(points: Array, part: Indices) -> tuple[Array, Mapping[int, str]]:
         corrected, refused = correct(points)
@@ -230,7 +230,7 @@ def _segment_group(
         if k in reasons:
             yield i, reasons[k]
         elif largest > EVALUATED_SHARE * tolerance:
-            # the deviation of a chord grows with the square of its length
+            # the deviation of a chord grows with the square of its length; 5 % more to be sure
             yield i, float(max(count + 1, math.ceil(count * math.sqrt(largest / tolerance) * 1.05)))
         else:
             yield i, Segments(begins[k], ends[segments], stretches[segments], largest, correction)

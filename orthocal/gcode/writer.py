@@ -1,11 +1,14 @@
-"""Writer of corrected lines: new coordinates and feeds, all other words unchanged."""
+"""Writer of corrected lines: new points, feeds and G-words of motion; other words are unchanged.
+
+Arcs become straight segments, so G2 and G3 become G1, and the words of their centres are omitted.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from orthocal.gcode.interpreter import STOPS, Modes, Step
+from orthocal.gcode.interpreter import COORDINATES, STOPS, Modes, Step
 from orthocal.gcode.lines import Line, PointLine, Word
 from orthocal.gcode.segmentation import Segments
 from orthocal.units import INCH, MM
@@ -14,7 +17,7 @@ FEWEST_DECIMALS = {MM: 4, INCH: 5}
 """Fewest decimals of a coordinate by unit."""
 
 MOST_DECIMALS = 9
-"""Largest number of decimals of a coordinate."""
+"""Largest number of decimals of a coordinate: 1e-9 mm, the resolution of a float at 1 m."""
 
 FEED_STEP = 1e-4
 """Relative change of the feed above which a new F is written."""
@@ -22,8 +25,9 @@ FEED_STEP = 1e-4
 FEED_DIGITS = 6
 """Number of significant digits of a feed."""
 
-_REPLACED = frozenset("XYZIJKR")
 _MOTIONS = frozenset({0.0, 1.0, 2.0, 3.0})
+"""G-words of motions along lines and arcs."""
+
 _ARCS = frozenset({2, 3})
 _CANCEL = 80.0
 _RESETS = frozenset({_CANCEL, 20.0, 21.0})
@@ -32,6 +36,9 @@ _RESETS = frozenset({_CANCEL, 20.0, 21.0})
 
 def find_decimals(unit: float, rounding: float) -> int:
     """Number of decimals with which rounding displaces a point by less than a distance.
+
+    A rounded point is off by at most √3/2 of the last decimal. The number is between
+    FEWEST_DECIMALS and MOST_DECIMALS, which limits the accuracy to 1e-9 of the unit.
 
     Args:
         unit: Unit of the coordinates, [m].
@@ -47,7 +54,8 @@ class Writer:
     Args:
         axes: Indices of the axes that the drives command.
         rounding: Largest displacement of a point by rounding, [m].
-        start: Position of the controller before the program, [m]; None if unknown.
+        start: Position (x, y, z) of the controller before the program, in machine coordinates,
+            [m]; None where unknown.
     """
 
     def __init__(
@@ -61,7 +69,8 @@ class Writer:
             words = " ".join(f"{'XYZ'[k]}%.{n}f" for k in axes)
             self._formats[unit] = (n, words, f"-{0.0:.{n}f}")
         self._position: list[float] = [0.0 if v is None else v for v in start]
-        """Rounded position that was written last, [m]."""
+        """Position (x, y, z) of the controller after the last written line, in machine
+        coordinates and rounded, [m]."""
         self._motion: int | None = None
         self._feed: float | None = None
 
@@ -79,9 +88,9 @@ class Writer:
         return line.text
 
     def write(self, step: Step, segments: Segments) -> list[str]:
-        """Lines of the segments of a motion."""
-        feeds = self._feeds(step, segments)
-        points = self._points(step, segments)
+        """Lines of the segments of a motion; tracks their end and feed."""
+        feeds = self._write_feeds(step, segments)
+        points = self._write_points(step, segments)
         motion = 0 if step.modes.motion == 0 else 1
         if isinstance(step.line, PointLine):
             code = None if step.line.motion is None else f"G{step.line.motion}"
@@ -89,7 +98,8 @@ class Writer:
             stops = ""
         else:
             defer = len(points) > 1
-            first, stops = self._begin(step.line, step.modes, points[0], feeds[0], defer=defer)
+            texts = (f"G{motion}", points[0], feeds[0])
+            first, stops = self._begin(step.line, step.modes, *texts, defer=defer)
         self._motion = motion
         if step.has_feed and not motion:
             self._feed = step.modes.feed
@@ -97,23 +107,23 @@ class Writer:
         if len(points) == 1:
             return [first + end]
         following = zip(points[1:], feeds[1:], strict=True)
-        texts = [first, *(f"{words} {feed}" if feed else words for words, feed in following)]
-        texts[-1] += stops
-        return [text + end for text in texts]
+        lines = [first, *(f"{words} {feed}" if feed else words for words, feed in following)]
+        lines[-1] += stops
+        return [line + end for line in lines]
 
     def _begin(
-        self, line: Line, modes: Modes, point: str, feed: str, *, defer: bool
+        self, line: Line, modes: Modes, motion: str, point: str, feed: str, *, defer: bool
     ) -> tuple[str, str]:
         """First line of a motion, and the stops to append to its last line.
 
         Args:
             line: The line of the program.
             modes: Modes during the line.
+            motion: G-word of the motion, G0 or G1.
             point: Coordinate words of the first point.
             feed: Feed word of the first segment; empty if the feed does not change.
             defer: Whether stops are deferred to the last line.
         """
-        motion = 0 if modes.motion == 0 else 1
         parts: list[str] = []
         stops = ""
         has_motion = has_point = False
@@ -121,29 +131,27 @@ class Writer:
         for item in line.items:
             if isinstance(item, str):
                 parts.append(item)
-                continue
-            letter, value = item.letter, item.value
-            if letter in _REPLACED or (letter == "P" and modes.motion in _ARCS):
+            elif item.letter in COORDINATES or (item.letter == "P" and modes.motion in _ARCS):
                 if not has_point:
-                    parts.append(f" {point}" if parts else point)
+                    parts.append(f" {point}")
                     has_point, feed_index = True, len(parts)
-            elif letter == "G" and value in _MOTIONS:
-                parts.append(f" G{motion}" if parts else f"G{motion}")
+            elif item.letter == "G" and item.value in _MOTIONS:
+                parts.append(f" {motion}")
                 has_motion = True
-            elif letter == "F" and motion:
+            elif item.letter == "F" and motion != "G0":
                 continue
-            elif letter == "M" and defer and value in STOPS:
+            elif item.letter == "M" and defer and item.value in STOPS:
                 stops += f" {item.text.strip()}"
             else:
                 parts.append(item.text)
         if feed:
             parts.insert(feed_index, f" {feed}")
-        if self._motion != motion and not has_motion:
-            parts.insert(_after_number(line), f" G{motion}" if line.items else f"G{motion}")
+        if motion != f"G{self._motion}" and not has_motion:
+            parts.insert(_after_number(line), f" {motion}")
         return "".join(parts).lstrip(), stops
 
-    def _points(self, step: Step, segments: Segments) -> list[str]:
-        """Coordinate words of the end of each segment."""
+    def _write_points(self, step: Step, segments: Segments) -> list[str]:
+        """Coordinate words of the end of each segment; updates the position."""
         unit, axes = step.modes.unit, self._axes
         decimals, form, negative_zero = self._formats[unit]
         base: Sequence[float] = step.offset
@@ -160,17 +168,17 @@ class Writer:
                 self._position[k] = round(value, decimals) * unit + base[k]
         return texts
 
-    def _feeds(self, step: Step, segments: Segments) -> list[str]:
-        """Feed word of each segment; empty if the feed does not change."""
-        programmed, changed = step.modes.feed, step.has_feed
+    def _write_feeds(self, step: Step, segments: Segments) -> list[str]:
+        """Feed word of each segment, empty if the feed does not change; updates the feed."""
+        programmed, required = step.modes.feed, step.has_feed
         if step.modes.motion == 0 or programmed is None:
             return [""] * len(segments.points)
         texts = []
         for stretch in segments.stretch:
             feed, current = programmed * stretch, self._feed
-            if changed or current is None or abs(feed - current) > FEED_STEP * current:
-                text = _significant(feed)
-                self._feed, changed = float(text), False
+            if required or current is None or abs(feed - current) > FEED_STEP * current:
+                text = _format_feed(feed)
+                self._feed, required = float(text), False
                 texts.append(f"F{text}")
             else:
                 texts.append("")
@@ -183,10 +191,10 @@ def _after_number(line: Line) -> int:
     return 1 if isinstance(first, Word) and first.letter == "N" else 0
 
 
-def _significant(value: float) -> str:
-    """Positive number with six digits, without an exponent."""
-    if value <= 0.0:
+def _format_feed(feed: float) -> str:
+    """Feed with FEED_DIGITS significant digits, without an exponent, which G-code does not have."""
+    if feed == 0.0:
         return "0"
-    decimals = max(FEED_DIGITS - 1 - math.floor(math.log10(value)), 0)
-    text = f"{value:.{decimals}f}"
+    decimals = max(FEED_DIGITS - 1 - math.floor(math.log10(feed)), 0)
+    text = f"{feed:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
