@@ -42,24 +42,26 @@ MAX_PAIRED_SETUPS = 24
 def wrong_units_and_signs(rows: Rows) -> Iterator[Family]:
     """Hypotheses that all readings of a group have a wrong unit, decimal point or sign.
 
-    A cycle may have a wrong unit or decimal point only.
+    Groups are the session, legs, gauges and setups. In addition, pairs of setups may have reversed
+    signs, and cycles a wrong unit or decimal point.
     """
-    groups = [g for g in _groups(rows) if rows.written[list(g.rows)].all()]
-    if not groups:
+    reversed_groups = [g for g in _reverse_groups(rows) if rows.written[list(g.rows)].all()]
+    if not reversed_groups:
         return
-    yield factor_family(rows, groups)
-    names = [name for name, indices in rows.setups.items() if rows.written[indices].all()]
-    if 3 < len(names) <= MAX_PAIRED_SETUPS:
-        pairs = combinations(names, 2)
-        yield factor_family(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
+    yield factor_family(rows, reversed_groups)
+    setups = [name for name, indices in rows.setups.items() if rows.written[indices].all()]
+    if 3 < len(setups) <= MAX_PAIRED_SETUPS:  # of fewer, a pair is all of them or all but one
+        pairs = combinations(setups, 2)
+        yield factor_family(rows, [_reverse("setups", rows.of_setups(p), p) for p in pairs])
     # not cycles of a single reading, such as the closing one, nor of all readings but one
-    groups += [
-        _reversed("cycle", indices, names=(name,), cycle=cycle)
-        for (name, cycle), indices in rows.cycles.items()
-        if name in names and 1 < len(indices) < len(rows.setups[name]) - 1
+    reversed_cycles = [
+        _reverse("cycle", indices, names=(setup,), cycle=cycle)
+        for (setup, cycle), indices in rows.cycles.items()
+        if setup in setups and 1 < len(indices) < len(rows.setups[setup]) - 1
     ]
-    yield _scaled(rows, groups, "wrong unit", UNITS)
-    yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS)
+    groups = reversed_groups + reversed_cycles
+    yield _scale(rows, groups, "wrong unit", UNITS)
+    yield _scale(rows, groups, "decimal point", DECIMAL_POINTS)
 
 
 def factor_family(
@@ -93,45 +95,50 @@ def _without_unreadable(rows: Rows, explanations: Sequence[Explanation]) -> list
     """
     steps = decimal_steps(rows.values)
     divisions = np.array([rows.gauge(i).resolution or 0.0 for i in range(rows.count)])
-    least = np.minimum(READ_FRACTION * divisions, steps[rows.written].min(initial=np.inf))
-    readable = (1.0 - STEP_TOLERANCE) * least
+    smallest_steps = np.minimum(READ_FRACTION * divisions, steps[rows.written].min(initial=np.inf))
 
     def can_be_read(explanation: Explanation) -> bool:
         concerned, factor = list(explanation.rows), explanation.factor or 1.0
-        return bool((factor * steps[concerned].min() >= readable[concerned]).all())
+        smallest = (1.0 - STEP_TOLERANCE) * smallest_steps[concerned].max()
+        return bool(factor * steps[concerned].min() >= smallest)
 
     return [e for e in explanations if e.kind != "decimal point" or can_be_read(e)]
 
 
-def _reversed(
+def _reverse(
     scope: Scope,
     indices: Indices,
     setups: tuple[str, ...] = (),
     names: tuple[str, ...] = (),
     cycle: int | None = None,
 ) -> Explanation:
-    """Explanation of a group of rows with reversed sign."""
+    """Explanation that the sign of all rows of a group is reversed.
+
+    Args:
+        scope: Kind of the group.
+        indices: Rows of the group.
+        setups: Setups that belong to the group with all their rows.
+        names: Name of the leg, gauge or setup in messages.
+        cycle: Number of a cycle; None for other groups.
+    """
     concerned = tuple(indices.tolist())
     return Explanation("reversed sign", scope, concerned, setups, names, cycle, factor=-1.0)
 
 
-def _groups(rows: Rows) -> list[Explanation]:
-    """Groups of readings that may have a common factor: session, legs, gauges and setups.
-
-    The explanation of each group is a reversed sign; `_scaled` replaces it.
-    """
+def _reverse_groups(rows: Rows) -> list[Explanation]:
+    """Explanations that the sign of the session, a leg, a gauge or a setup is reversed."""
     setup_names = tuple(rows.setups)
-    explanations = [_reversed("session", np.arange(rows.count), setup_names)]
+    explanations = [_reverse("session", np.arange(rows.count), setup_names)]
     for (scope, name), setups in rows.groups.items():
-        explanations.append(_reversed(scope, rows.of_setups(setups), setups, (name,)))
+        explanations.append(_reverse(scope, rows.of_setups(setups), setups, (name,)))
     if len(setup_names) > 1:
         explanations += [
-            _reversed("setup", indices, (name,)) for name, indices in rows.setups.items()
+            _reverse("setup", indices, (name,)) for name, indices in rows.setups.items()
         ]
     return explanations
 
 
-def _scaled(
+def _scale(
     rows: Rows,
     groups: Sequence[Explanation],
     kind: AnomalyKind,
@@ -141,6 +148,12 @@ def _scaled(
 
     The step is compared with the largest noise of the gauges of a group. With factors below 1 any
     step is plausible: they make it finer.
+
+    Args:
+        rows: The rows.
+        groups: Explanations of the groups by a reversed sign.
+        kind: Kind of the new explanations.
+        factors: Factors that correct the readings.
     """
     of_rows = decimal_steps(rows.values)
     noise_of_rows = np.array([rows.sigma(i) for i in range(rows.count)])
