@@ -24,24 +24,25 @@ TWELVE_ROWS = tuple(
     for sign in "+-"
     for row in rows
 )
-"""Rows of equation (8): direction, leg and sign.
+"""Names of the rows of equation (8): direction, leg and sign.
 
 "+" is the reading in the maximum posture minus that in the zero posture, "-" the reading in the
 minimum posture minus that in the zero posture. The last block is (Δx_z, Δz_x).
 """
 
+SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
+"""Names of the rows of the reduced system, maximum minus minimum: direction and leg, ordered as in
+Table 1 of the paper."""
+
 LEAST_RESIDUAL = 1e-12
 """Least scale of the residuals in a problem with bounds, [m], or [1] with a prior."""
 
-SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
-"""Rows of the reduced system, maximum minus minimum, in the order of the paper's Table 1."""
-
 
 def displacement_angle(displacement: float, *, length: float) -> float:
-    """Angle α of the other two legs when the tool moves along an axis: sin α = displacement/L.
+    """Angle α by which the other two legs incline when the tool moves along an axis.
 
-    For the minimum posture α_min = asin((ρ_min − L)/L), negative (corrected: the paper prints
-    asin(ρ_min/L)).
+    sin α = displacement/L. The displacement to the minimum posture is ρ_min − L, with the lowest
+    coordinate ρ_min of the slides. Its angle α_min is negative (the paper prints asin(ρ_min/L)).
 
     Args:
         displacement: Signed displacement of the tool from the mechanical zero, [m].
@@ -70,7 +71,8 @@ def leg_parallelism_matrix(
 
         Δy_x = c Δρ_x + b Δρ_y,  b = sin α,  c = (1 − μ + sin α) tan α
 
-    With μ = 0.5 this is equation (7). A row of the reduced system is maximum minus minimum.
+    Δy_x is the difference of readings in y on leg x, and Δρ are the offsets. With μ = 0.5 this is
+    equation (7). A row of the reduced system is maximum minus minimum.
 
     Args:
         length: Leg length L, [m].
@@ -128,7 +130,7 @@ def invert_equation_8(matrix: ArrayLike, *, covariance: ArrayLike | None = None)
     a = np.asarray(matrix, dtype=np.float64)
     if np.linalg.matrix_rank(a, rtol=RANK_THRESHOLD) < 3:
         raise NotIdentifiableError(
-            "the rows do not determine the three offsets", parameters=("x", "y", "z")
+            "the rows do not determine the three offsets", parameters=("Δρ_x", "Δρ_y", "Δρ_z")
         )
     if covariance is None:
         return np.asarray(np.linalg.pinv(a))
@@ -138,14 +140,17 @@ def invert_equation_8(matrix: ArrayLike, *, covariance: ArrayLike | None = None)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearProblem:
-    """Problem linearised about the active offsets of the controller."""
+    """Problem linearised about the active offsets of the controller.
+
+    Entries are readings or their differences. Those of other gauges are scaled so that their noise
+    is that of the first gauge.
+    """
 
     problem: CalibrationProblem
     residual: Array
-    """y − h, gauge zeros eliminated, shape (n_entries,), [m of the first gauge]."""
+    """y − h, gauge zeros projected out, shape (n_entries,), [m], scaled."""
     jacobian: Array
-    """dh/dθ̂, gauge zeros eliminated, shape (n_entries, n_free), [m of the first gauge per prior
-    std]."""
+    """dh/dθ, gauge zeros projected out, shape (n_entries, n_free), [m per prior std], scaled."""
     information: Information
     """Information of the Jacobian."""
 
@@ -163,7 +168,7 @@ class LinearProblem:
         problem = self.problem
         rows = slice(None) if use is None else use
         jacobian, residual = self.jacobian[rows], self.residual[rows]
-        if len(jacobian) > 2 * problem.n_free:  # R has the same normal equations in fewer rows
+        if len(jacobian) > 2 * problem.n_free:  # R of QR has the same normal equations, fewer rows
             r = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
             jacobian, residual = r[:, :-1], r[:, -1]
         reference = problem.active_theta / problem.theta_scale
@@ -204,10 +209,15 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
 
 
 def require_finite(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
-    """Refuse predictions that are not finite, as for a tip that does not touch its rod.
+    """Refuse predictions and derivatives that are not finite, as of a tip that misses its rod.
+
+    Args:
+        problem: The problem.
+        prediction: Predicted readings, shape (n_entries,), [m].
+        jacobian: Their derivatives, shape (n_entries, n_free).
 
     Raises:
-        SessionError: If a prediction is not finite; names setup and posture.
+        SessionError: If a prediction or a derivative is not finite; names setup and posture.
     """
     bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
     if not bad.size:

@@ -1,10 +1,10 @@
 """Commanded points with backlash taken up, for a controller that does not compensate it.
 
 Corrected points hold for the middle of both sides of the backlash. To reach such a point from one
-side, the screws of the drives must move farther by their lags. The drives then move by d, which
-differs from the lags by the slope of the screws' periodic errors. To first order the commanded
-point changes by J d, with the Jacobian J of the nominal forward kinematics. The second order is
-below 0.01 µm for a backlash of 0.1 mm.
+side, the slides must be driven farther by their lags. The commanded drive coordinates then change
+by d, which differs from the lags by the slope of the screws' periodic errors. To first order the
+commanded point changes by J d, with the Jacobian J = ∂p/∂ρ of the nominal forward kinematics. The
+second order is below 0.01 µm for a backlash of 0.1 mm.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError
 from orthocal.export.linuxcnc.drive_compensation import (
     find_periodic_errors,
     without_periodic_errors,
@@ -39,16 +38,17 @@ relative to the characteristic length."""
 def find_lags(robot: Robot, errors: Mapping[str, float]) -> Array:
     """Lags of the drives on one side of the backlash, shape (n_drives,), [m, rad].
 
-    The lag is half of the difference between both sides at the mechanical zero.
+    The lag is half of the difference between both sides at the mechanical zero: positive if the
+    drive stays behind its command. It is 0 for a robot without backlash.
 
     Args:
         robot: The robot.
         errors: Values by parameter name, [SI].
     """
     map_, zero = error_map(robot), robot.drive_zero[None]
-    smooth = without_periodic_errors(robot, errors)  # the lag would depend on their phase
     if "approach" not in map_.conditions:
         return np.zeros(len(robot.drives))
+    smooth = without_periodic_errors(robot, errors)  # the lag would depend on their phase
 
     def actual(side: str) -> Array:
         conditions = UseConditions(approach=side * len(robot.drives))
@@ -78,17 +78,18 @@ class ApproachSides:
         self._displacement = calibration.displacement
         self._periodic = find_periodic_errors(robot, calibration.errors)
         self._closure = nominal_closure(robot)
-        middle = tool_at_zero(robot)
-        half = np.full(middle.size, IDENTIFICATION_REGION * robot.characteristic_length)
-        form = find_nominal_form(robot, middle, half)
+        center = tool_at_zero(robot)
+        half = np.full(center.size, IDENTIFICATION_REGION * robot.characteristic_length)
+        form = find_nominal_form(robot, center, half)
         self._form = form if isinstance(form, SlidesWithRods) else None
+        """Nominal inverse kinematics in closed form, which is faster; None for other machines."""
 
     def drives(self, points: Array) -> Array:
         """Nominal drive coordinates of points; see `Sides.drives`."""
         commanded = points[:, self._axes]
         if self._form is not None:
             return self._form(commanded)
-        failures: Failures = {}
+        failures: Failures = {}  # points out of reach become NaN instead of an error
         return self._closure.inverse(commanded, failures=failures)
 
     def command(self, points: Array, sides: Array) -> Array:
@@ -103,26 +104,34 @@ class ApproachSides:
             step = np.zeros(3)
             step[axis] = STEP
             columns.append((self.drives(base + step) - self.drives(base - step)) / (2.0 * STEP))
-        inverse_jacobian = np.stack(columns, axis=-1)
-        if not np.isfinite(inverse_jacobian).all():
-            raise ClosureError("is at the border of the workspace", posture="a point")
+        inverse_jacobian = np.stack(columns, axis=-1)  # NaN at the border of the workspace
         moves = self._moves(self.drives(base), sides[shifted] * self._lags)
         shifts = np.linalg.solve(inverse_jacobian, moves[..., None])
         commanded[np.ix_(shifted, self._axes)] += shifts[..., 0]
         return commanded
 
     def _moves(self, drives: Array, lags: Array) -> Array:
-        """Changes of the drives that move their screws by lags, shape (k, n_drives), [m, rad].
+        """Changes of the commanded coordinates that move the slides by lags.
+
+        The controller moves the motor of a drive to m = ρ + c(ρ) with its compensation c. The
+        slide is at s + e(s) with s = m - a, the active offset a and the periodic error e of the
+        screw. The slide moves by the lag if
+
+            s' + e(s') = s + e(s) + lag,    ρ' + c(ρ') = m + s' - s.
+
+        Two fixed-point steps solve the second equation; c changes little with ρ.
 
         Args:
-            drives: Nominal drive coordinates, shape (k, n_drives), [m, rad].
+            drives: ρ, nominal drive coordinates, shape (k, n_drives), [m, rad].
             lags: Lags of the drives, shape (k, n_drives), [m, rad].
+
+        Returns:
+            ρ' - ρ, shape (k, n_drives), [m, rad].
         """
         if self._periodic is None:
             return lags
         motors = drives + self._displacement(drives)
         screws = motors - self._offsets
-        lagging = self._periodic.invert(screws + self._periodic(screws) + lags)
-        motors += lagging - screws
+        motors += self._periodic.invert(screws + self._periodic(screws) + lags) - screws
         moved = motors - self._displacement(drives + lags)
         return np.asarray(motors - self._displacement(moved) - drives)

@@ -57,7 +57,7 @@ class Sides(Protocol):
             sides: Sides of the drives, shape (k, n_drives).
 
         Returns:
-            Points to command, shape (k, 3), [m].
+            Points to command, shape (k, 3), [m]; NaN at the border of the workspace.
         """
 
 

@@ -57,6 +57,9 @@ class Correction(Protocol):
         """
 
 
+AT_BORDER = "is at the border of the workspace"
+"""Reason to refuse a point on whose sides no points can be commanded."""
+
 MotionCorrection = Callable[[Array, Indices], tuple[Array, Mapping[int, str]]]
 """Correction of points, with the motion of each point."""
 
@@ -104,7 +107,9 @@ def segment_motions(
 
     def correct_on_sides(points: Array, part: Indices) -> tuple[Array, Mapping[int, str]]:
         corrected, refused = correct(points)
-        return sides.command(corrected, reversals.sides[part]), refused
+        commanded = sides.command(corrected, reversals.sides[part])
+        at_border = np.flatnonzero(~np.isfinite(commanded).all(axis=1)).tolist()
+        return commanded, {**dict.fromkeys(at_border, AT_BORDER), **refused}
 
     segments = _segment(parts, correct_on_sides, tolerance)
     return [

@@ -51,6 +51,7 @@ from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
+from orthocal.gcode.segmentation import AT_BORDER, segment_motions
 from orthocal.io.files import write_files
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 from orthocal.units import MM, UM
@@ -630,6 +631,19 @@ def test_points_on_a_side_of_the_backlash(calibration):
     assert np.abs(tool - points).max() < SECOND_ORDER
 
 
+def test_points_at_the_border_are_refused(calibration):
+    """Where a leg would be square to its slide, central differences of the drives do not exist."""
+    lags = find_lags(calibration.robot, calibration.errors)
+    (leg, *_) = calibration.robot.legs.values()
+    border = [0.0, leg.length - 1e-6, 0.0]
+    sides = ApproachSides(calibration, ACTIVE, lags)
+    commanded = sides.command(np.array([[0.0, 0.0, 0.0], border]), np.ones((2, 3)))
+    assert np.isfinite(commanded).all(axis=1).tolist() == [True, False]
+    paths = Paths.from_motions([Motion((0.0, 0.0, 0.0), tuple(border))])
+    (refused,) = segment_motions(paths, lambda points: (points, {}), tolerance=1e-3, sides=sides)
+    assert refused.reason == AT_BORDER
+
+
 SECOND_ORDER = 0.01e-6
 """Second order of the lags, [m]."""
 
@@ -708,7 +722,7 @@ def test_motions_are_divided_where_a_drive_reverses():
     sides = DrivesAsCoordinates()
     parts = split_at_reversals(paths, sides)
     assert parts.motion.tolist() == [0, *[1] * 4, 2]
-    assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
+    assert parts.start[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
     assert parts.sides.astype(int).tolist() == [
         *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1])
     ]
