@@ -13,7 +13,7 @@ SHORTEST_LEG, LONGEST_LEG = 0.02, 5.0
 """Limits of the length of a leg or rod, [m]."""
 
 UNITS = {"mm": MM, "deg": DEG}
-"""Units of dimensions, to their factors to SI."""
+"""Units of dimensions in machine.yaml, mapped to their factors to SI."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,8 @@ class Dimension:
     name: str
     """Name of the field of `Dimensions`."""
     question: str
-    """Question to the user; {zero} is the coordinate of the slides in the mechanical zero, [mm]."""
+    """Template of a question to the user; {zero} is the coordinate of the slides in the mechanical
+    zero, [mm]."""
     comment: str
     """Comment in machine.yaml, of one or more lines."""
     unit: str = "mm"
@@ -31,7 +32,7 @@ class Dimension:
     form: str = ""
     """Form of several numbers, such as LEAST:LARGEST, with their separator; "" for one number."""
     usual: str | None = None
-    """Default answer; None if the user must state it."""
+    """Default answer, in the unit of the key; None if the user must state it."""
 
     @property
     def key(self) -> str:
@@ -49,7 +50,7 @@ class Dimension:
         return self.form.count(self.separator) + 1 if self.separator else 1
 
     def to_si(self, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - a float or a tuple
-        """Value of the field in SI units, from numbers in the unit of the key."""
+        """Value of the field in SI units, from numbers in the unit of the key: one, or a tuple."""
         values = tuple(v * UNITS[self.unit] for v in numbers)
         return values if self.separator else values[0]
 
@@ -86,15 +87,18 @@ ROD_RADIUS = Dimension("rod_radius", "Radius of a rod, mm", "Radius of a rod.")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dimensions(ABC):
-    """Dimensions of a machine of one kind."""
+    """Dimensions of a machine of one kind, and the files that describe it.
+
+    Defaults are those of the paper's Orthoglide, unless a kind states others.
+    """
 
     rods_apart: float = 0.08
     """Distance between the axes of a leg's two rods, [m]."""
     rod_radius: float = 0.0055
     """Radius of a rod, [m]."""
     workspace: tuple[tuple[float, float], ...] | None = None
-    """Limits of the tool's coordinates relative to the mechanical zero, [m]; by default those of
-    the kind."""
+    """Stated limits of the workspace relative to the mechanical zero, one pair for each coordinate,
+    [m]; None for those of the kind."""
 
     kind: ClassVar[str]
     """Name of the kind in machine.yaml and on the command line."""
@@ -110,8 +114,8 @@ class Dimensions(ABC):
     """Description of the default workspace."""
     growing: ClassVar[str] = "outwards"
     """Direction of a slide's motion if its coordinate grows."""
-    read_legs: ClassVar[bool] = True
-    """Whether readings of the legs determine offsets of the drives."""
+    legs_determine_offsets: ClassVar[bool] = True
+    """Whether readings of the legs determine the offsets of the drives."""
 
     @classmethod
     def drives_of(cls) -> tuple[str, ...]:
@@ -132,18 +136,21 @@ class Dimensions(ABC):
 
     @property
     def box(self) -> tuple[tuple[float, float], ...] | None:
-        """Limits of the workspace, [m]; None for the largest cube that the machine reaches."""
+        """Limits of the workspace, [m]; None for the largest cube that the machine reaches.
+
+        They are the stated ones, or those of the kind.
+        """
         return self.workspace
 
     @property
     @abstractmethod
-    def words(self) -> str:
-        """Description of the dimensions, in mm."""
+    def summary(self) -> str:
+        """Dimensions in mm as a sentence part, such as "legs of 250 mm, travel 100 to 325 mm"."""
 
     @property
     def title(self) -> str:
         """Description of the kind and the dimensions."""
-        return f"A machine of the kind {self.kind}: {self.words}."
+        return f"A machine of the kind {self.kind}: {self.summary}."
 
     @abstractmethod
     def urdf(self, name: str) -> str:

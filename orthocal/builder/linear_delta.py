@@ -101,7 +101,7 @@ class LinearDelta(Dimensions):
     at_zero: ClassVar[str] = "with the tool in the middle of the bed"
     usual_workspace: ClassVar[str] = "half the delta radius to each side, and up to the radius"
     growing: ClassVar[str] = "upwards"
-    read_legs: ClassVar[bool] = False
+    legs_determine_offsets: ClassVar[bool] = False
 
     @property
     def zero(self) -> float:
@@ -163,7 +163,7 @@ class LinearDelta(Dimensions):
         return find_rods_problem(self.rods_apart, self.rod_radius, self.rod)
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """Description of the dimensions, in mm."""
         lower, upper = self.travel
         return (

@@ -98,11 +98,11 @@ class SlidingLegs(Dimensions):
         return find_rods_problem(self.rods_apart, self.rod_radius, leg)
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """Description of the dimensions, in mm."""
-        return self.words_of_legs()
+        return self.summary_of_legs()
 
-    def words_of_legs(self) -> str:
+    def summary_of_legs(self) -> str:
         """Description of the dimensions of slides and legs, in mm."""
         lower, upper = self.travel
         return (
@@ -263,10 +263,10 @@ class InclinedOrthoglide(SlidingLegs):
         return SlidingLegs.find_problem(self)
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """Description of the dimensions, in mm and degrees."""
         angle = in_unit(self.elevation, "deg")
-        return f"slides at {angle}°, {self.words_of_legs()}"
+        return f"slides at {angle}°, {self.summary_of_legs()}"
 
     def frames(self) -> list[Array]:
         """Frames of the slides, at 0°, 120° and 240° about the vertical axis; Z is horizontal."""

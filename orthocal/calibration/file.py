@@ -33,6 +33,12 @@ SCHEMA = "orthocal/calibration/18"
 DERIVED_TOLERANCE = 1e-9
 """Largest relative difference of a derived number from its recomputed value."""
 
+NEGLIGIBLE = 1e-15
+"""Largest absolute difference of a derived number, [SI], for numbers near 0."""
+
+SMALLEST_EIGENVALUE = -1e-6
+"""Smallest eigenvalue of a correlation matrix; rounding errors of a singular one are above it."""
+
 OTHER_KEYS = ("schema", "decision", "findings")
 """Keys outside the record: the schema, and keys of `calibrate --json`."""
 
@@ -128,7 +134,9 @@ def _read_document(
         if isinstance(plain, dict) and key in plain:
             plain[key] = _without(plain[key], names)
     record = validate(CalibrationRecord, plain, where=file, error=CalibrationFileError)
-    for key, problem in _find_contradictions(record):
+    contradiction = next(_find_contradictions(record), None)
+    if contradiction is not None:
+        key, problem = contradiction
         raise CalibrationFileError(problem, where=f"{file}: {key}")
     if robot is None:
         robot = load_recorded_robot(record.robot_record, file=file)
@@ -178,10 +186,9 @@ def _check_derived(
 ) -> None:
     """Refuse stated numbers that differ from the recomputed ones; missing numbers are accepted."""
     if isinstance(expected, dict):
-        stated_parts = stated if isinstance(stated, dict) else dict.fromkeys(expected)
-        for name in [name for name in expected if name in stated_parts]:
+        for name in [name for name in expected if name in stated]:
             inner_key = f"{key}.{name}" if key else name
-            _check_derived(stated_parts[name], expected[name], file, inner_key)
+            _check_derived(stated[name], expected[name], file, inner_key)
         return
     if isinstance(expected, list):
         for i, pair in enumerate(zip(stated, expected, strict=True)):
@@ -192,7 +199,7 @@ def _check_derived(
         agrees = stated is expected
     else:
         agrees = is_number and math.isclose(
-            stated, expected, rel_tol=DERIVED_TOLERANCE, abs_tol=1e-15
+            stated, expected, rel_tol=DERIVED_TOLERANCE, abs_tol=NEGLIGIBLE
         )
     if not agrees:
         stated_text = "null" if stated is None else shorten(str(stated))
@@ -221,11 +228,11 @@ def _check_estimates(calibration: Calibration, file: str) -> None:
     """Refuse standard deviations that contradict the covariances."""
     n = len(calibration.free)
     keys = ("std", "std_scatter", "std_scaled")
-    covariances = zip(keys, calibration.error_covariances, strict=True)
-    variances = {key: np.diag(covariance)[:n] for key, covariance in covariances}
     free = [(i, p) for i, p in enumerate(calibration.parameters) if p.free]
-    for key, variance in variances.items():
-        for (i, p), size in zip(free, np.sqrt(np.abs(variance)).tolist(), strict=True):
+    for key, covariance in zip(keys, calibration.error_covariances, strict=True):
+        variances = np.diag(covariance)[:n]  # unmodelled errors follow
+        # rounding errors may make a variance of 0 negative
+        for (i, p), size in zip(free, np.sqrt(np.abs(variances)).tolist(), strict=True):
             stated, expected = finite_or_none(getattr(p, key)), finite_or_none(size)
             _check_derived(stated, expected, file, f"parameters[{i}].{key}")
 
@@ -271,7 +278,8 @@ def _is_covariance(matrix: Array) -> bool:
     """True for symmetric numbers without negative variances, and for NaN only: unknown."""
     if not np.isfinite(matrix).all():
         return bool(np.isnan(matrix).all())
-    std = np.sqrt(np.abs(np.diag(matrix)))
-    correlation = matrix / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
+    std = np.sqrt(np.abs(np.diag(matrix)))  # a negative variance stays one in the correlation
+    scale = np.where(std > 0.0, std, 1.0)
+    correlation = matrix / np.outer(scale, scale)
     symmetric = np.abs(matrix - matrix.T).max() <= DERIVED_TOLERANCE * np.abs(matrix).max()
-    return bool(symmetric and np.linalg.eigvalsh(correlation).min() >= -1e-6)
+    return bool(symmetric and np.linalg.eigvalsh(correlation).min() >= SMALLEST_EIGENVALUE)

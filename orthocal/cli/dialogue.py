@@ -83,7 +83,7 @@ def _questions(kind: type[Dimensions]) -> list[_Question]:
     words = {
         "growing": kind.growing, "at_zero": kind.at_zero, "letters": ",".join(kind.letters)
     }  # fmt: skip
-    usual = {} if kind.read_legs else {COUNTS: "up", AT_ZERO: "{zero}"}
+    usual = {} if kind.legs_determine_offsets else {COUNTS: "up", AT_ZERO: "{zero}"}
     return [
         *(_Question(d.key, d.question, d.usual, d) for d in kind.keys),
         *(_Question(k, text.format(**words), usual.get(k)) for k, text in COUNTING.items()),

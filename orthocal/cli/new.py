@@ -247,7 +247,7 @@ class _Design:
             equipment = load_dial(options.gauge, equipment)
         self.effects = options.read_effects()
         kind, tolerance = dimensions.read_kind(), options.tolerance
-        reads_legs = kind.read_legs or bool(equipment.owned)
+        reads_legs = kind.legs_determine_offsets or bool(equipment.owned)
         if not reads_legs:
             _require_bed(kind, options)
         self.machine, self.counting, asked = find_answers(kind, dimensions.by_key())
@@ -487,7 +487,7 @@ def _report(folder: Path, design: _Design) -> None:
         lines += [BED_WORDS, *describe_gains(plan.find_sensor_gains(), plan.expected.reported.rms)]
     programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
-        f"Wrote {folder}: {design.machine.words}.",
+        f"Wrote {folder}: {design.machine.summary}.",
         f"To change a dimension, edit {folder / 'machine.yaml'}, then run",
         f"  orthocal new {quote_path(folder)} --again",
         f"Wrote {folder / FIRST}: session.yaml, readings.csv, sheet.html and "
@@ -539,7 +539,7 @@ def _advise_plan(folder: Path, session: Path) -> str:
     """Command that replaces an outdated plan of a machine."""
     from orthocal.builder.machine_file import MACHINE, read_machine
 
-    reads_legs = read_machine(folder / MACHINE)[0].read_legs
+    reads_legs = read_machine(folder / MACHINE)[0].legs_determine_offsets
     if reads_legs or exists(session / "plan.json"):
         out = f"--out {quote_path(session)} --force"
         return f"plan again:\n  orthocal plan {quote_path(folder)} {out}"
