@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.assessment.recommendation import STRONG, compute_log_evidence
-from orthocal.effects.loading import measurable_effects
+from orthocal.effects.loading import identified_effects
 from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.selection import complete_model
@@ -79,7 +79,7 @@ def compare_effects(session: Session) -> EffectComparison | None:
     stated = tuple(session.robot.effect_names)
     if not candidates:
         return EffectComparison((), stated, stated, (), lacking) if lacking else None
-    present = [e.name for e in measurable_effects(session.robot)]
+    present = [e.name for e in identified_effects(session.robot)]
     not_measurable = [n for n in stated if n not in present]
     model = complete_model(session.robot.parameters)
     all_effects = (*not_measurable, *order_effects(candidates))
@@ -119,7 +119,7 @@ def compare_effects(session: Session) -> EffectComparison | None:
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:
     """Effects to compare, and effects whose conditions are missing in some of the readings."""
     robot = session.robot
-    present = [e.name for e in measurable_effects(robot)]
+    present = [e.name for e in identified_effects(robot)]
     any_conditions = any(r.conditions for r in session.readings)
     possible = missing_effects(session) if any_conditions and robot.chosen_effects is None else ()
     any_time = any(r.conditions and r.conditions.time for r in session.readings)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocal.effects.loading import measurable_effects
+from orthocal.effects.loading import identified_effects
 from orthocal.effects.protocol import Effect
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.session.session import Session
@@ -58,7 +58,7 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
         problem: Calibration problem with priors.
         noise: Standard deviation of a reading, [m].
     """
-    effects = measurable_effects(problem.session.robot)
+    effects = identified_effects(problem.session.robot)
     if not effects:
         return ()
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)

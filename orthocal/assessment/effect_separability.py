@@ -23,7 +23,7 @@ from orthocal.assessment.wording import lines_in_file
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.loading import (
-    measurable_effects,
+    identified_effects,
     neutral_values,
 )
 from orthocal.hypotheses.linear_model import linear_model
@@ -49,7 +49,7 @@ def find_unshown_effects(session: Session) -> list[Finding]:
     Raises:
         ClosureError: If the nominal machine cannot reach a posture.
     """
-    if not measurable_effects(session.robot):
+    if not identified_effects(session.robot):
         return []
     findings = [
         *_incomplete_conditions(session),
@@ -62,7 +62,7 @@ def find_unshown_effects(session: Session) -> list[Finding]:
 def _incomplete_conditions(session: Session) -> Iterator[Finding]:
     """Findings about readings without a condition that `calibrate` needs (`require_conditions`)."""
     explicit = session.robot.chosen_effects is not None
-    for effect in measurable_effects(session.robot):
+    for effect in identified_effects(session.robot):
         for condition in (c for c in COLUMNS_OF_CONDITIONS if c in effect.conditions):
             missing = readings_without(session, condition)
             if missing and (explicit or len(missing) < len(session.readings)):
@@ -133,7 +133,7 @@ def _inseparable(session: Session) -> Iterator[Finding]:
     """Findings about parameters of effects that are inseparable."""
     model = linear_model(session)
     linearisation = model.at_reference(keep_jacobian=True)
-    effects = {e.name: e for e in measurable_effects(session.robot)}
+    effects = {e.name: e for e in identified_effects(session.robot)}
     members = {name: parameter_units(effect, session) for name, effect in effects.items()}
     free = list(enumerate(model.problem.free))
     effect_columns = [i for names in members.values() for i, n in free if n in names]

@@ -49,7 +49,8 @@ class GeometryErrors(Effect):
     """Errors of joint placements, then of the frames in use.
 
     The component of a drive's placement along or about the axis of the drive is omitted, because
-    it is the same error as the offset.
+    it is the same error as the offset. Of an axis oblique to the joint frame the component with
+    the largest direction cosine is omitted.
     """
 
     @classmethod
@@ -65,7 +66,8 @@ class GeometryErrors(Effect):
         """Twists of placements (see `Effect.placements`)."""
         components: dict[Placement, list[ca.SX]] = {}
         for e in self.errors:
-            twist = components.setdefault(self.robot.placement_of(e), [ca.SX(1, 1)] * 6)
+            zeros = [ca.SX(1, 1)] * 6  # structural zeros: absent errors cost nothing
+            twist = components.setdefault(self.robot.placement_of(e), zeros)
             twist[e.axis] = twist[e.axis] + errors[e.name]
         return {placement: ca.vertcat(*twist) for placement, twist in components.items()}
 
@@ -75,6 +77,7 @@ def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[Elementary
     model, drives = robot.model, {d.name for d in robot.drives}
     for i in range(1, model.njoints):
         name = str(model.names[i])
+        # of an oblique axis the largest component: the others and the offset replace it
         drive_axis = int(np.abs(joint_axis(model, i)).argmax()) if name in drives else None
         for axis in range(6):
             if axis != drive_axis:
@@ -110,10 +113,16 @@ def _error(
 def _of_complete_model(robot: Robot) -> dict[str, range]:
     """Components of the twist of each frame that belong to the complete model.
 
-    Frames of closures are ends of links, such as rods. If such a frame carries the tool and its
-    partner does not turn against it, its errors are those of the partner and move the tool on its
-    link. Otherwise its translation changes a length of its link. Its rotation matters only to
-    closures that constrain rotations.
+    Two frames of a closure are ends of links, such as rods.
+
+    | frame                                              | components               |
+    |----------------------------------------------------|--------------------------|
+    | on a link that does not carry the tool             | all                      |
+    | on the tool's link, turns against the other frame  | translation; all of `6d` |
+    | on the tool's link, does not turn                  | none: those of the other |
+    | of no closure, such as the tool centre point       | none                     |
+
+    A frame of several closures has the largest set.
     """
     tool = set(carriers(robot.model, robot.frame_id(robot.tcp.frame))) if robot.tcp else set()
     complete = dict.fromkeys(robot.frames, range(0))

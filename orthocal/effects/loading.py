@@ -117,7 +117,12 @@ def _add_loaded_parameters(robot: Robot) -> Robot:
 
 
 def _add_parameters(robot: Robot) -> Robot:
-    """Robot with the error parameters of its effects."""
+    """Robot with the error parameters of its effects.
+
+    Raises:
+        RobotError: If two effects have a parameter of the same name, or a sum, tolerance or model
+            names a parameter that does not exist.
+    """
     where, declared = f"{robot.yaml}: orthocal", robot.declared
     errors: dict[str, ElementaryError] = {}
     for effect in robot_effects(robot):
@@ -127,14 +132,13 @@ def _add_parameters(robot: Robot) -> Robot:
                     f"its parameter '{error.name}' exists already",
                     where=f"{where}.effects.{effect.name}",
                 )
-    elementary, stated = tuple(errors.values()), declared.models
-    models = {**stated, **{name: p for name, p in MODELS.items() if name not in stated}}
+    elementary = tuple(errors.values())
     try:
         parameters = build_parameters(
             elementary,
             sums=declared.parameters,
             overrides=_read_tolerances(robot).overrides,
-            models=models,
+            models=declared.models | {k: v for k, v in MODELS.items() if k not in declared.models},
             find_redundant=partial(find_redundant_errors, robot, elementary),
             further=adjustment_parameters(robot, errors),
         )
@@ -148,7 +152,8 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
     """Effects of a robot: drives, geometry, adjustments between sessions, then named effects.
 
     Raises:
-        RobotError: If a named effect does not exist, or one of its keys does not fit.
+        RobotError: If a tolerance is invalid, a named effect does not exist, or one of its keys is
+            missing or invalid.
     """
     tolerances = _read_tolerances(robot)
     effects: list[Effect] = [
@@ -175,8 +180,8 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
-def measurable_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Named effects of a robot that have parameters to identify."""
+def identified_effects(robot: Robot) -> tuple[Effect, ...]:
+    """Named effects of a robot with parameters; every model identifies them."""
     return tuple(
         e
         for e in robot_effects(robot)
@@ -193,11 +198,15 @@ def neutral_values(robot: Robot) -> dict[Condition, float]:
 
 
 def reading_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot that change the readings of gauges."""
+    """Effects of a robot that change the readings of gauges: those that override `reading`."""
     return tuple(e for e in robot_effects(robot) if type(e).reading is not Effect.reading)
 
 
 def _read_tolerances(robot: Robot) -> ToleranceKeys:
-    """Tolerances in the robot's YAML."""
+    """Tolerances in the robot's YAML.
+
+    Raises:
+        RobotError: If a key or a value is invalid.
+    """
     where, under, data = str(robot.yaml), "orthocal.tolerances", robot.declared.tolerances
     return validate(ToleranceKeys, data, where=where, error=RobotError, under=under)

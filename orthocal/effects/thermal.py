@@ -71,10 +71,13 @@ class Thermal(Effect):
         """Build the effect for a robot (see `Effect.from_keys`)."""
         stated = {"legs": keys.legs_ppm * PPM, "screws": keys.screws_ppm * PPM}
         std = read_limit(keys.tolerance_ppm) * PPM
-        errors = (
-            ElementaryError(f"{part}.expansion", cls.name, part, "1/K", std) for part in stated
+        errors = tuple(
+            ElementaryError(
+                name=f"{part}.expansion", kind=cls.name, owner=part, unit="1/K", prior_std=std
+            )
+            for part in stated
         )
-        return cls(robot, keys.reference_C, stated, _fixed_points(keys, robot), tuple(errors))
+        return cls(robot, keys.reference_C, stated, _fixed_points(keys, robot), errors)
 
     @property
     def neutral(self) -> Mapping[Condition, float]:
@@ -105,8 +108,8 @@ class Thermal(Effect):
     def negligible_difference(self, condition: Condition, change: float) -> float:
         """Difference of temperature (see `Effect.negligible_difference`), [K].
 
-        Per kelvin, the longest rod and the longest screw, from its fixed bearing to the mechanical
-        zero, grow by no more than their coefficients at the upper tolerance.
+        The bound is the growth of the longest rod and of the longest screw, from its fixed bearing
+        to the mechanical zero, with both coefficients at the limits of their tolerances.
         """
         drives = zip(self.robot.drives, self.fixed, strict=True)
         rods = (rod.length for rod in self.robot.rods.values())
@@ -119,14 +122,16 @@ class Thermal(Effect):
 
 
 def _fixed_points(keys: ThermalKeys, robot: Robot) -> tuple[float | None, ...]:
-    """Coordinate of the fixed bearing of each screw, [m]; None for a revolute drive."""
+    """Coordinate of the fixed bearing of each screw, [m]; None for a revolute drive.
+
+    Raises:
+        RobotError: If a named drive is not linear, or if a coordinate is needed and not stated.
+    """
     linear = [d.name for d in robot.drives if d.unit == "m"]
     for name in keys.fixed_mm:
         if name not in linear:
-            raise RobotError(
-                f"'{name}' is not a linear drive; expected one of {', '.join(linear)}",
-                where="fixed_mm",
-            )
+            expected = f"expected one of {', '.join(linear)}" if linear else "the robot has none"
+            raise RobotError(f"'{name}' is not a linear drive; {expected}", where="fixed_mm")
     fixed = {name: value * MM for name, value in keys.fixed_mm.items()}
     if len(fixed) < len(linear):
         fixed = _common_point(robot, linear) | fixed

@@ -12,7 +12,7 @@ from datetime import timedelta
 
 from orthocal.assessment.effect_limits import EffectLimits
 from orthocal.assessment.effect_separability import WARMER
-from orthocal.effects.loading import measurable_effects, neutral_values
+from orthocal.effects.loading import identified_effects, neutral_values
 from orthocal.effects.protocol import Condition
 from orthocal.planning.plan_comparison import Comparison
 from orthocal.session.points import one_row_per_point
@@ -52,7 +52,7 @@ def find_further_readings(
         The shortest further readings that determine the effect, or else the longest ones. Effects
         whose limit no further readings reduce have no entry.
     """
-    conditions = {e.name: e.conditions for e in measurable_effects(comparison.plan.robot)}
+    conditions = {e.name: e.conditions for e in identified_effects(comparison.plan.robot)}
     proposals = []
     for limit in limits:
         if limit.determined:

@@ -30,7 +30,7 @@ from orthocal.assessment.plausibility import (
 from orthocal.assessment.words.effects import condition_incomplete
 from orthocal.assessment.words.plausibility import outstanding_error
 from orthocal.calibration.file import calibration_json
-from orthocal.effects.loading import measurable_effects
+from orthocal.effects.loading import identified_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.output.text.answer import describe_machine
@@ -397,7 +397,7 @@ def test_names_with_dots_keep_the_owners_of_errors_apart(name, label, owner):
 
 @pytest.mark.parametrize(("two", "advice"), [(False, "Complete the column"), (True, "Differences")])
 def test_differences_of_two_postures_cannot_state_an_approach(two, advice):
-    (effect,) = measurable_effects(effect_plan("backlash").robot)
+    (effect,) = identified_effects(effect_plan("backlash").robot)
     found = condition_incomplete(effect, "approach", [3, 4], 2, 9, two_postures=two)
     assert found.text.startswith("2 of 9 readings (lines 3, 4) do not state")
     assert found.action.startswith(advice)

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from orthocal.arrays import Indices
-from orthocal.effects.loading import measurable_effects, with_effects
+from orthocal.effects.loading import identified_effects, with_effects
 from orthocal.effects.registry import effect_names, find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import CalibrationProblem
@@ -41,7 +41,7 @@ def missing_effects(session: Session) -> tuple[str, ...]:
             robot = with_effects(session.robot, (*present, name))
         except RobotError:  # the YAML lacks one of its keys, or a package is broken
             continue
-        if any(e.name == name for e in measurable_effects(robot)):
+        if any(e.name == name for e in identified_effects(robot)):
             names.append(name)
     return tuple(names)
 
