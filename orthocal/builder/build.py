@@ -205,7 +205,8 @@ def _effects_text(effects: Sequence[str] | EffectKeyValues) -> str:
         fields = find_effect(name, where="effects", error=RobotError).keys.model_fields.items()
         keys = {key: f.default for key, f in fields if isinstance(f.default, float)}
         keys |= stated.get(name, {})
-        lines.append(f"    {name}: {json.dumps(keys).replace(chr(34), '')}\n")
+        mapping = json.dumps(keys).replace('"', "")  # in YAML's flow style without quotes
+        lines.append(f"    {name}: {mapping}\n")
     return (
         "  # Effects beside geometry: limits of backlash and others, which are identified from\n"
         f"  # readings that state their conditions.\n  effects:\n{''.join(lines)}"

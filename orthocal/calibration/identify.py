@@ -31,6 +31,7 @@ from orthocal.statistics.identifiability import find_base_parameters
 from orthocal.statistics.information import marginalise
 
 MAX_BASE_ROUNDS = 8
+"""Largest number of fits until the base parameters do not change."""
 
 
 def identify(
@@ -96,7 +97,7 @@ def identify(
 
 
 def _read_start(start: ArrayLike, problem: CalibrationProblem) -> Array:
-    """Initial free parameters with exact mountings, shape (n_free,), [SI].
+    """Initial free parameters, shape (n_free,), [SI]; nuisance parameters are 0.
 
     Raises:
         ValueError: If there is not one finite number for each free error of the machine.
@@ -141,7 +142,7 @@ def _fit_base(
                 "the readings determine none of the free parameters",
                 parameters=problem.machine_selection.names,
             )
-        names = [c.terms[0][0] for c in combinations]
+        names = [c.terms[0][0] for c in combinations]  # one parameter for each combination
         if names == base_names:
             break
         base_names = names

@@ -21,8 +21,12 @@ GROUP = "orthocal.effects"
 """Group of the entry points by which installed packages offer effects."""
 
 
-def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
-    """Require that an offered class is an effect of the name of its entry point."""
+def _require_effect(name: str, offered: type[Effect]) -> type[Effect]:
+    """The offered class, which must be an effect with the name of its entry point.
+
+    Raises:
+        TypeError: If it is not, or if it needs a condition that does not exist.
+    """
     if not issubclass(offered, Effect) or offered.name != name:
         raise TypeError(f"{offered.__qualname__} is not an Effect with name = '{name}'")
     if unknown := [c for c in offered.conditions if c not in get_args(Condition)]:
@@ -41,7 +45,7 @@ BUILT_IN = {
 """Built-in effects and their classes, in the order of a machine; effects on drives act in the
 reverse order. Each class is imported on first use."""
 
-_EFFECTS = Registry[type[Effect]](GROUP, "effect", _read_effect, BUILT_IN)
+_EFFECTS = Registry[type[Effect]](GROUP, "effect", _require_effect, BUILT_IN)
 
 
 def register_effect(effect: type[Effect]) -> None:

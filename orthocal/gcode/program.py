@@ -211,7 +211,7 @@ def _subject(step: Step, refused: Refused) -> str:
 
 
 def _estimate_segments(motion: Motion) -> float:
-    """Estimated number of segments of a motion."""
+    """Estimated number of segments of a motion; those of an arc are about a tenth as long."""
     length = math.dist(motion.start, motion.end)
     if motion.arc is None:
         return 1.0 + length / LONGEST_SEGMENT

@@ -34,8 +34,8 @@ REFIT_LOG_BAYES = 4.0
 """Smallest log Bayes factor, to first order, of hypotheses that are relinearised."""
 
 N_FAMILIES = 34.0
-"""Number of families that share the prior probability; each effect is as likely as a family.
-Settings of a printer take the place of offsets in a controller."""
+"""Number of families that share the prior probability equally. Each effect that the model lacks
+counts as a family. Families of printers replace those of controllers with offsets."""
 
 MAX_REFITTED = 8
 """Most single hypotheses that are relinearised in each step."""
@@ -117,7 +117,7 @@ class FamilyScorer:
         model, about, deviation = self.model, state.about, state.remaining
         products, inner = base, np.zeros(1)
         edits = None if family.edits is None else family.edits.select(chosen)
-        if edits is not None:
+        if edits is not None:  # products of the deviation d plus the change c: |d + c|²
             changed, cross = model.products(edits, about, deviation)
             products = Products(
                 base.along + changed.along, base.square + 2.0 * cross + changed.square
@@ -187,6 +187,7 @@ class FamilyScorer:
             ),
             reverse=True,
         )
+        # half of the places for the best of all, the others for the best of each other kind
         terms = [self.term(scored[i][0], h) for _, i, h in ranked[: 3 * MAX_REFITTED]]
         chosen = terms[: MAX_REFITTED // 2]
         kinds = {(t.explanation.kind, t.explanation.scope) for t in chosen}
