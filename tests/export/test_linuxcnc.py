@@ -39,6 +39,7 @@ from orthocal import (
 )
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.assessment.wording import tool_mm
 from orthocal.calibration.calibration import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import write_core
@@ -423,8 +424,12 @@ def test_module_files_state_tool_limits_and_error(full, exported):
     assert "restore the old INI lines" in exported["README.md"]
     assert "[AXIS_Z]\nMIN_LIMIT = -60\nMAX_LIMIT = 60\n" in exported["kinematics.ini"]
     assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.400\n" in exported["kinematics.ini"]
-    stated = float(re.search(r"at most ([\d.]+) µm", exported["README.md"])[1])
+    stated = float(re.search(r"within ([\d.]+) µm", exported["README.md"])[1])
     assert 0.0 < stated <= WITHIN * 1e6
+    assert (
+        f"identified errors corrected: {tool_mm(assessment_of(full).tool.compensated)} RMS"
+        in exported["README.md"]
+    )
 
 
 def test_module_of_offsets_alone(offsets):
@@ -436,7 +441,7 @@ def test_module_of_offsets_alone(offsets):
     assert "(JOINT_0 350.000, JOINT_1 300.000, JOINT_2 -20.000)" in files["README.md"]
     assert "HOME_OFFSET = 300.000\n" in files["kinematics.ini"]
     assert "#define DEGREE 1\n" in files["orthocal_core.c"]
-    assert "at most 0.001 µm" in files["README.md"]
+    assert "within 0.001 µm" in files["README.md"]
 
 
 def test_limits_of_the_axes_are_those_of_region_and_controller(offsets):

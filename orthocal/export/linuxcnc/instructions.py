@@ -15,7 +15,7 @@ from orthocal.assessment.controller_entries import (
     find_screws,
     offsets_to_enter,
 )
-from orthocal.assessment.wording import joined
+from orthocal.assessment.wording import joined, tool_mm
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
     BEYOND_FACE,
@@ -365,6 +365,18 @@ def _describe_limits(homes: Sequence[JointHome], *, own: bool) -> str:
     return f"Narrower limits of your own change by: {changes}."
 
 
+def _describe_expected(calibration: Calibration) -> str:
+    """Sentence about the tool error that remains with a module."""
+    tool = assessment_of(calibration).tool
+    if tool is None:
+        return "The uncertainty of the calibration is in its report."
+    expected = tool_mm(tool.compensated)
+    return (
+        f"Expected tool error with all identified errors corrected: {expected} RMS. The\n"
+        "calibration knows the machine no better."
+    )
+
+
 def write_module_page(
     calibration: Calibration,
     approximation: Approximation,
@@ -392,7 +404,11 @@ def write_module_page(
     nominal = beyond = ""
     if approximation.nominal_error is not None:
         error = f"{approximation.nominal_error / MM:.3f}"
-        nominal = f"With nominal kinematics the error is up to {error} mm. "
+        nominal = (
+            f"Without the module the tool is wrong by up to {error} mm. This includes a shift and\n"
+            "rotation of all positions, which do not matter on a workpiece that is aligned on the "
+            "machine.\n"
+        )
     if approximation.error_beyond is not None:
         error = rounded_up(approximation.error_beyond / UM)
         beyond = f" {BEYOND_FACE / MM:g} mm beyond a face the error is up to {error} µm."
@@ -409,6 +425,7 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
+        "expected": _describe_expected(calibration),
         "compensation": describe_compensation(homes, module=True)
         + _describe_conditions(approximation)
         + _describe_unchanged(calibration, module=True),
