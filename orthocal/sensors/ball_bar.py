@@ -142,8 +142,8 @@ class BallBar(ToolSensor):
 
     def describe(self) -> str:
         """Short description with length and fixed ball."""
-        centre = ", ".join(map(show_mm, self.centre))
-        return f"ball bar of {show_mm(self.length)} mm about ({centre}) mm"
+        x, y, z = map(show_mm, self.centre)
+        return f"ball bar of {show_mm(self.length)} mm about X{x} Y{y} Z{z} mm"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
