@@ -359,7 +359,7 @@ def _residual_rows(
     try:
         passive = problem.close(fit.linearised_theta, start=fit.solution.passive)
         by_linear = fitted(problem.predict(fit.linearised_theta, passive))
-    except ClosureError:  # the linearised machine cannot be assembled
+    except ClosureError:  # the linearised machine cannot reach a posture
         by_linear = np.full(len(session.readings), np.nan)
     predicted = session.values - row_noise * observations.rows(fit.residual)
     prediction_error = row_noise * cross_validate_setups(fit)

@@ -77,10 +77,10 @@ class Fit:
     noises: NoiseEstimate
     """Noise of a reading of each gauge."""
     prediction: Array
-    """h at the solution, gauge zeros at 0, shape (n_entries,), [m of the first gauge]
-    (`CalibrationProblem`)."""
+    """h at the solution, gauge zeros at 0, shape (n_entries,), [m, scaled], see
+    `CalibrationProblem`."""
     jacobian: Array
-    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m of the first gauge per prior std]."""
+    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per prior std, scaled]."""
     information: Information
     """Information of the Jacobian."""
     seconds_build: float = 0.0
@@ -112,7 +112,7 @@ class Fit:
 
     @property
     def residual(self) -> Array:
-        """Readings minus predictions and zeros, shape (n_entries,), [m of the first gauge]."""
+        """Readings minus predictions and zeros, shape (n_entries,), [m, scaled]."""
         return _residual(self.program, self.solution, self.prediction)
 
     @property
@@ -143,7 +143,7 @@ class Fit:
         It is NaN if nothing determines the noise.
 
         Args:
-            noise: Standard deviation of a reading, [m of the first gauge]; by default `sigma`, with
+            noise: Standard deviation of a reading, [m, scaled]; by default `sigma`, with
                 which the parameters were estimated.
         """
         return self._to_si(self._posterior(noise).covariance)
@@ -258,7 +258,7 @@ def fit_problem(
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
     fit = _solve_with_noise(program, linear, groups, start, rounds=rounds)
-    require_assembly(fit.problem, fit.solution, options=program.options)
+    require_reachable(fit.problem, fit.solution, options=program.options)
     seconds = built - began, time.perf_counter() - built
     return replace(fit, seconds_build=seconds[0], seconds_solve=seconds[1])
 
@@ -276,14 +276,14 @@ def _solve_with_noise(
     initial = initial_sigmas(problem.session, problem.observations)
     several = len(groups) > 1
     solution, sigma = _solve_first(program, linear, groups, start)
-    iterations, compared = solution.iterations, True
+    iterations, mirrors_compared = solution.iterations, True
     for remaining in reversed(range(rounds)):
         evaluation = _evaluate(program, solution, sigma, groups, initial)
         estimated, ratio = floored_sigma(evaluation.noises.common), evaluation.noises.ratio
         change = estimated / sigma * (ratio / problem.noise_ratio)
         converged = not math.isfinite(estimated) or _agrees(change)
         converged = converged or not (several or _depends_on_sigma(program))
-        if (converged and compared) or not remaining:
+        if (converged and mirrors_compared) or not remaining:
             break
         if not converged:
             sigma = estimated
@@ -291,9 +291,12 @@ def _solve_with_noise(
             problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
         # the better sides of mirrored directions may depend on sigma
-        compared = converged or not len(problem.mirrored)
+        mirrors_compared = converged or not len(problem.mirrored)
         solution = program.solve(
-            sigma=sigma, start=solution.theta, start_passive=solution.passive, mirrored=compared
+            sigma=sigma,
+            start=solution.theta,
+            start_passive=solution.passive,
+            mirrored=mirrors_compared,
         )
         iterations += solution.iterations
     noises = evaluation.noises
@@ -379,7 +382,7 @@ def floored_sigma(noise: Noise) -> float:
     return max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else math.nan
 
 
-def require_assembly(
+def require_reachable(
     problem: CalibrationProblem, solution: Solution, *, options: SolverOptions
 ) -> None:
     """Refuse a solution that cannot reach a posture, as wrong readings can cause.
@@ -459,7 +462,7 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
 
 
 def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
-    """Residuals with the optimal gauge zeros, shape (n_entries,), [m of the first gauge]."""
+    """Residuals with the optimal gauge zeros, shape (n_entries,), [m, scaled]."""
     problem, o = program.problem, program.problem.observations
     deviation = problem.values - prediction
     if program.options.loss.robust:
@@ -480,7 +483,7 @@ def _scatter(
     Args:
         program: The program.
         linear: dh/dθ̂, shape (n_entries, n_free), and its information.
-        residual: Residuals, zeros eliminated, shape (n_entries,), [m of the first gauge].
+        residual: Residuals, zeros eliminated, shape (n_entries,), [m, scaled].
         sigma: Standard deviation of a reading of the first gauge in the present solution, [m].
         groups: The gauges.
         at_bound: Mask of the parameters at a bound, shape (n_free,).

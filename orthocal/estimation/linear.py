@@ -142,15 +142,15 @@ def invert_equation_8(matrix: ArrayLike, *, covariance: ArrayLike | None = None)
 class LinearProblem:
     """Problem linearised about the active offsets of the controller.
 
-    Entries are readings or their differences. Those of other gauges are scaled so that their noise
-    is that of the first gauge.
+    Entries are single readings, scaled to the noise of the first gauge (`CalibrationProblem`).
     """
 
     problem: CalibrationProblem
     residual: Array
-    """y − h, gauge zeros projected out, shape (n_entries,), [m], scaled."""
+    """y − h, gauge zeros projected out, shape (n_entries,), [m, scaled]."""
     jacobian: Array
-    """dh/dθ, gauge zeros projected out, shape (n_entries, n_free), [m per prior std], scaled."""
+    """dh/dθ, gauge zeros projected out, shape (n_entries, n_free), [m per prior std,
+    scaled]."""
     information: Information
     """Information of the Jacobian."""
 

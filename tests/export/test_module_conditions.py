@@ -187,7 +187,7 @@ SECOND_ORDER = 50e-9
 
 
 def test_page_states_temperature_and_payload(thermal, monkeypatch):
-    monkeypatch.setattr(instructions, "_describe_expected", lambda _: "")  # of an assessment
+    monkeypatch.setattr(instructions, "_describe_remaining", lambda *_: "")  # of an assessment
     known, approximation, _ = thermal
     known = SimpleNamespace(**vars(known), only_offsets=False)
     loaded = replace(approximation, payload=0.5, error_of_heavier_payload=1.2e-6)

@@ -154,10 +154,10 @@ def _sigma_without_rows(fit: Fit, contributions: Array) -> tuple[Array, float]:
 
     Args:
         fit: The fit.
-        contributions: Contribution of each row to Σ r², shape (n_rows,), [m² of the first gauge].
+        contributions: Contribution of each row to Σ r², shape (n_rows,), [m², scaled].
 
     Returns:
-        Standard deviations, shape (n_rows,), [m of the first gauge], and degrees of freedom.
+        Standard deviations, shape (n_rows,), [m, scaled], and degrees of freedom.
     """
     noise = fit.noise
     if noise.source != "residuals" or fit.loss.robust:
@@ -175,8 +175,8 @@ def cross_validate_setups(fit: Fit) -> Array:
     """Prediction errors of every row from all other setups (leave-one-out cross-validation).
 
     Returns:
-        Measured minus predicted reading with the best gauge zeros, shape (n_rows,), [m of the first
-        gauge]; NaN if the other setups do not determine the parameters.
+        Measured minus predicted reading with the best gauge zeros, shape (n_rows,), [m,
+        scaled]; NaN if the other setups do not determine the parameters.
     """
     problem, o = fit.problem, fit.problem.observations
     errors = np.full(o.plus.size, np.nan)

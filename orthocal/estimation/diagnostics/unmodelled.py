@@ -5,8 +5,8 @@ first order, unmodelled errors θᵤ bias the estimate by B θᵤ,
 
     B = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P⁻¹
 
-The priors of θᵤ therefore add a covariance to the uncertainty of the estimate. Readings are in
-metres of the first gauge (`CalibrationProblem`).
+The priors of θᵤ therefore add a covariance to the uncertainty of the estimate. Readings are
+scaled to the noise of the first gauge (`CalibrationProblem`).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class UnmodelledErrors:
     """Mask of the errors whose tolerances the scale multiplies, shape (n_unmodelled,)."""
     jacobian: Array
     """∂h/∂θ̂ᵤ: change of the readings by one prior standard deviation of each error, zeros
-    eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
+    eliminated, shape (n_entries, n_unmodelled), [m, scaled]."""
 
 
 @cached_per_robot
@@ -125,7 +125,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
 
     Returns:
         ∂h/∂θ̂ᵤ per stated prior standard deviation of each error, zeros eliminated, shape
-        (n_entries, n_names), [m of the first gauge].
+        (n_entries, n_names), [m, scaled].
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])

@@ -365,14 +365,22 @@ def _describe_limits(homes: Sequence[JointHome], *, own: bool) -> str:
     return f"Narrower limits of your own change by: {changes}."
 
 
-def _describe_expected(calibration: Calibration) -> str:
-    """Sentence about the tool error that remains with a module."""
+def _describe_remaining(calibration: Calibration, approximation: Approximation) -> str:
+    """Sentences about the tool error without a module, and that which remains with it."""
+    text = ""
+    if approximation.nominal_error is not None:
+        error = f"{approximation.nominal_error / MM:.3f}"
+        text = (
+            f"Without the module the tool is wrong by up to {error} mm. This includes a shift and\n"
+            "rotation of all positions, which do not matter on a workpiece that is aligned on the "
+            "machine.\n"
+        )
     tool = assessment_of(calibration).tool
     if tool is None:
-        return "The uncertainty of the calibration is in its report."
+        return f"{text}The uncertainty of the calibration is in its report."
     expected = tool_mm(tool.compensated)
     return (
-        f"Expected tool error with all identified errors corrected: {expected} RMS. The\n"
+        f"{text}Expected tool error with all identified errors corrected: {expected} RMS. The\n"
         "calibration knows the machine no better."
     )
 
@@ -401,14 +409,7 @@ def write_module_page(
         form = f"The inverse kinematics are {form}."
     else:
         form = f"The inverse kinematics are the nominal closed form, corrected by\n{form}."
-    nominal = beyond = ""
-    if approximation.nominal_error is not None:
-        error = f"{approximation.nominal_error / MM:.3f}"
-        nominal = (
-            f"Without the module the tool is wrong by up to {error} mm. This includes a shift and\n"
-            "rotation of all positions, which do not matter on a workpiece that is aligned on the "
-            "machine.\n"
-        )
+    beyond = ""
     if approximation.error_beyond is not None:
         error = rounded_up(approximation.error_beyond / UM)
         beyond = f" {BEYOND_FACE / MM:g} mm beyond a face the error is up to {error} µm."
@@ -424,8 +425,7 @@ def write_module_page(
         "region": approximation.region,
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
-        "nominal": nominal,
-        "expected": _describe_expected(calibration),
+        "remaining": _describe_remaining(calibration, approximation),
         "compensation": describe_compensation(homes, module=True)
         + _describe_conditions(approximation)
         + _describe_unchanged(calibration, module=True),
