@@ -32,6 +32,7 @@ class _Repeats:
     """Readings of one place in one setup, at least two; see `Observations.place`."""
 
     rows: Indices
+    """Rows of the session, in the order of measuring, shape (n,)."""
     square: float
     """Sum of squared deviations from their mean, relative to the variance of a reading."""
     difference: float

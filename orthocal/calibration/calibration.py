@@ -137,7 +137,10 @@ class Calibration(CalibrationRecord):
 
     @property
     def standard_deviations(self) -> Array:
-        """Standard deviations of `free` from noise, priors and unmodelled errors, [SI]."""
+        """Total standard deviations of `free`, shape (n_machine,), [SI].
+
+        They contain noise, priors and unmodelled errors.
+        """
         return np.array([p.std for p in self.free])
 
     @property

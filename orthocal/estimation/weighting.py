@@ -168,7 +168,7 @@ class Scatter:
     loss: Loss
     """Cost of a residual."""
     residual: Array
-    """Residuals, gauge zeros eliminated, [m]."""
+    """Residuals, gauge zeros projected out, [m]."""
     used: Array
     """Leverages, parts of the effective number of parameters."""
     sigma: Array

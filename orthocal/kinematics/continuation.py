@@ -207,6 +207,7 @@ def solve_closures(
     Raises:
         ClosureError: If a posture cannot be reached or is outside the limits of a joint, or if it
             is singular and this is not allowed; states the posture and the residual.
+        ValueError: If the start values have another shape.
     """
     count = len(targets)
     labels = label_postures(names, count)

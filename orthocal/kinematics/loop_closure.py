@@ -300,6 +300,10 @@ class LoopClosure:
 
         Returns:
             Shape (K, 3) or (3,), [m]; a batch has S in front.
+
+        Raises:
+            RobotError: If the robot has no tool.
+            ValueError: If drive and passive coordinates do not fit each other.
         """
         frame = require_tcp(self.robot).frame
         d, single = self._as_commands(drives)
@@ -546,6 +550,11 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
 
 def require_within_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> None:
     """Refuse drive coordinates beyond the travel of a drive.
+
+    Args:
+        robot: The robot.
+        drives: Drive coordinates, shape (K, n_drives), [m, rad].
+        names: Names of the rows, for messages.
 
     Raises:
         ClosureError: Of `find_beyond_travel`, for the first such row.

@@ -114,6 +114,8 @@ def simulate_session(
         SessionError: If the noise is not stated, a reading does not exist, or it is outside the
             range of the gauge.
         ClosureError: If the machine cannot reach a posture.
+        ParameterError: If the name of an error is unknown.
+        ValueError: If `sigma` is no number of at least 0.
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
     require_numbers(errors, argument="errors")

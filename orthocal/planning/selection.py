@@ -180,6 +180,9 @@ class SetupSearch:
             workers: Number of processes; the result does not depend on it.
             report: Called after each start with its number and the smallest error so far.
             first: Result of the first start, if it is known.
+
+        Raises:
+            ValueError: If `starts` is below 1.
         """
         if starts is None:
             starts = MIN_TOTAL_CANDIDATES // self.candidates.count
@@ -259,7 +262,11 @@ class SetupSearch:
         return PlannedSetups((*plan.setups, added), information, self.error_of(information))
 
     def information_of(self, *setups: PlannedSetup) -> Array:
-        """Inverse covariance of the state from the readings of setups, (n_state, n_state)."""
+        """Inverse covariance of the state from the readings of setups, (n_state, n_state).
+
+        Raises:
+            ValueError: If a setup has fewer than two readings.
+        """
         total = np.zeros_like(self.prior)
         for planned in setups:
             if len(planned.chosen) < MIN_READINGS:

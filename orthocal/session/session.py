@@ -95,8 +95,9 @@ class Posture:
     Args:
         name: Name in the session.
         form: Kind of `values`: `tcp` or `joints`.
-        values: Commanded coordinates of the tool centre point, [m], or of the drives, [m, rad].
-        drives: Commanded drive coordinates ρ minus the active offsets, [m, rad].
+        values: Commanded coordinates of the tool centre point, shape (n_coordinates,), [m], or of
+            the drives, shape (n_drives,), [m, rad].
+        drives: Commanded drive coordinates minus the active offsets, shape (n_drives,), [m, rad].
 
     Raises:
         ValueError: If the form is unknown.

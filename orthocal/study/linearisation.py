@@ -89,7 +89,12 @@ class LinearisationStudy(Study):
         return len(self.sizes) * len(self.directions)
 
     def prepare(self) -> _Prepared:
-        """The problem, its linearisation, and the paper's equations."""
+        """The problem, its linearisation, and the paper's equations.
+
+        Raises:
+            ParameterError: If a sensor has nuisance parameters.
+            NotIdentifiableError: If the readings do not determine a free parameter.
+        """
         problem = build_problem(self.session, free=self.free, prior=False)
         if problem.n_free > problem.n_machine:
             raise ParameterError(
@@ -401,8 +406,8 @@ class MethodErrors:
 
     name: str
     errors: Array
-    """Largest error of an estimate for each size, RMS over the directions, [mm or mrad]; NaN if the
-    method fails in a direction."""
+    """Largest error of an estimate for each size, RMS over the directions, shape (n_sizes,), [mm or
+    mrad]; NaN if the method fails in a direction."""
     standard_error: float
     """Standard error from noise, [mm or mrad]."""
     exceeds_resolution: float | None
@@ -418,11 +423,11 @@ class LinearisationSummary:
     """Summary of a linearisation study."""
 
     sizes: Array
-    """Sizes of the machines, ascending, [mm or mrad]."""
+    """Sizes of the machines, ascending, shape (n_sizes,), [mm or mrad]."""
     methods: tuple[MethodErrors, ...]
     reading: Array
     """Largest error of a linearised difference of readings for each size, RMS over the directions,
-    [mm]."""
+    shape (n_sizes,), [mm]."""
     steps: tuple[int | None, ...]
     """Gauss-Newton steps to convergence in all directions for each size; None if any diverges."""
     resolution: float

@@ -264,7 +264,10 @@ class RandomMachines:
         return all(np.abs(one - other).max() < NEGLIGIBLE for one, other in (readings, tools))
 
     def draw(self, number: int) -> tuple[Array, np.random.Generator]:
-        """True errors of a machine and its gauges in prior stds, and the generator of its noise."""
+        """True errors of a machine and its gauges, and the generator of its noise.
+
+        The errors have the shape (n_free,), [prior std].
+        """
         rng = np.random.default_rng((self.seed, number))
         drawn = rng.normal(size=self.truth.n_free)
         positive = [p.positive for p in self.truth.parameters]

@@ -27,11 +27,11 @@ class ReadingExpressions:
     group: SensorGroup
     """The sensor group."""
     passive_index: Indices
-    """Indices of the passive coordinates on which the reading depends."""
+    """Indices of the passive coordinates on which the reading depends, shape (n,)."""
     second_index: Indices
-    """Indices of the passive coordinates in the second posture of a pair; empty for others."""
+    """Those in the second posture of a pair, shape (m,); empty for other sensors."""
     theta_index: Indices
-    """Indices of the free parameters of the machine on which the reading depends."""
+    """Indices of the free parameters of the machine on which the reading depends, shape (k,)."""
     constants: ca.SX
     """Constants of the sensor and conditions of the reading, shape (n_constants,)."""
     nuisance: ca.SX

@@ -175,7 +175,11 @@ class _Workbook:
         self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
 
     def read(self, name: str | None) -> list[Sheet]:
-        """Read the visible sheets, all sheets if none is visible, or the sheet with a name."""
+        """Read the visible sheets, all sheets if none is visible, or the sheet with a name.
+
+        Raises:
+            SessionError: If there is no such sheet, or none at all.
+        """
         if not self._sheets:
             raise SessionError("is a workbook without worksheets")
         chosen = [s for s in self._sheets if s[1]] or self._sheets
