@@ -176,7 +176,7 @@ class ScrewEntry:
     identified: Array
     """A and B of the identified machine, shape (2,), [m]."""
     enter: Array
-    """A and B to enter, shape (2,), [m]: `identified`, or `active` if the change is undetermined."""
+    """A and B to enter, shape (2,), [m]: `active` if the change is undetermined."""
     uncertainty: float
     """Expanded uncertainty of the amplitude, [m]."""
 

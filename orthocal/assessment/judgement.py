@@ -358,18 +358,18 @@ def _independent_contrasts(
 def _describe_order(session: Session) -> list[Finding]:
     """Finding about joined sessions that were not given in the order of measuring."""
     sessions = linear_model(session).sessions
-    given, last, times = sessions.labels[-1], sessions.ordered_labels[-1], sessions.times
-    if last == given:
+    listed_last, last, times = sessions.labels[-1], sessions.ordered_labels[-1], sessions.times
+    if last == listed_last:
         return []
     if times and times[last] > times[given]:
-        return [describe_wrong_time(given, last)]
+        return [describe_wrong_time(listed_last, last)]
     corrections = dict(zip(sessions.labels, sessions.corrections, strict=True))
     kind: Correction = (
         "compensation" if corrections[given][0] == corrections[last][0] else "offsets"
     )
     if kind == "offsets" and session.firmware is not None:
         kind = "settings"
-    return [describe_wrong_order(given, last, kind)]
+    return [describe_wrong_order(listed_last, last, kind)]
 
 
 def _describe_detectable(session: Session) -> Finding:

@@ -96,8 +96,8 @@ def _key_in_session(reading: orthocal.Reading, *, joined: bool) -> tuple[object,
     from orthocal.session.session import split_label
 
     *names, cycle = reading.key[:4]
-    own = (None if n is None else split_label(n, joined=joined)[1] for n in names)
-    return (*own, cycle, *reading.key[4:])
+    names_in_session = (None if n is None else split_label(n, joined=joined)[1] for n in names)
+    return (*names_in_session, cycle, *reading.key[4:])
 
 
 def _require_measured_again(session: orthocal.Session, other: orthocal.Session) -> None:

@@ -253,10 +253,10 @@ def _draw_setting(deviations: Array, gauge: Gauge, sigma: float, rng: np.random.
         sigma: Standard deviation of a reading, [m].
         rng: Generator.
     """
-    setting = float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO))
+    shown = float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO))
     half = gauge.half_range - SPARE_NOISE * sigma
     low, high = -half - min(deviations, default=0.0), half - max(deviations, default=0.0)
-    return round(float(np.clip(setting, low, high)) if low <= 0.0 <= high else setting, 6)
+    return round(float(np.clip(shown, low, high)) if low <= 0.0 <= high else shown, 6)
 
 
 def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:

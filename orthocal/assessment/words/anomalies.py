@@ -255,25 +255,25 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
-def describe_wrong_time(given: str, last: str) -> Finding:
-    """Finding about joined sessions that were not given in the order of their times.
+def describe_wrong_time(listed_last: str, last: str) -> Finding:
+    """Finding about joined sessions that are not listed in the order of their times.
 
     Args:
-        given: Session that was given last.
+        listed_last: Session that is listed last.
         last: Session that was measured last.
     """
     return review(
         "wrong order",
-        f"Session {given} was given last, but session {last} was measured later.",
-        f"Give session {last} last, or correct the times of the readings.",
+        f"Session {listed_last} is listed last, but session {last} was measured later.",
+        f"List session {last} last, or correct the times of the readings.",
     )
 
 
-def describe_wrong_order(given: str, last: str, kind: Correction) -> Finding:
+def describe_wrong_order(listed_last: str, last: str, kind: Correction) -> Finding:
     """Finding about joined sessions of which an earlier one has a correction that the last lacks.
 
     Args:
-        given: Session that was given last.
+        listed_last: Session that is listed last.
         last: Session with the correction.
         kind: The correction.
     """
@@ -284,9 +284,9 @@ def describe_wrong_order(given: str, last: str, kind: Correction) -> Finding:
     }[kind]
     return note(
         "wrong order",
-        f"In session {given}, which was given last, {lacking}, unlike in session {last}. The "
-        f"present {numbers} are assumed to be those of session {given}.",
-        f"If session {last} is the latest, give it last.",
+        f"In session {listed_last}, which is listed last, {lacking}, unlike in session {last}. The "
+        f"present {numbers} are assumed to be those of session {listed_last}.",
+        f"If session {last} is the latest, list it last.",
     )
 
 

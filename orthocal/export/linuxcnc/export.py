@@ -216,11 +216,11 @@ def _limit_axes(
     for k, low, high in zip(
         approximation.coordinates, inverse.lower.tolist(), inverse.upper.tolist(), strict=True
     ):
-        own = (-math.inf, math.inf) if stated is None else stated[k]
-        limits[k] = max(low, own[0] - origin[k]), min(high, own[1] - origin[k])
+        axis = (-math.inf, math.inf) if stated is None else stated[k]
+        limits[k] = max(low, axis[0] - origin[k]), min(high, axis[1] - origin[k])
         if not limits[k][0] < limits[k][1]:
             raise ParameterError(
-                f"[AXIS_{LETTERS[k]}] has the limits {millimetres(own)} mm; expected a part of the "
+                f"[AXIS_{LETTERS[k]}] has the limits {millimetres(axis)} mm; expected a part of the "
                 f"region of the module, {millimetres([low + origin[k], high + origin[k]])} mm",
                 where="--ini",
             )

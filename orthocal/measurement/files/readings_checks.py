@@ -393,9 +393,9 @@ def check_range(
     ratio = abs(value_mm) / max(-lowest, highest)
     of_setup = np.asarray(of_setup_mm)
     n_in_range = np.count_nonzero((lowest <= of_setup) & (of_setup <= highest))
-    whole = all(np.round(v) == v for v in (value_mm, *of_setup[np.isfinite(of_setup)]))
+    whole_numbers = all(np.round(v) == v for v in (value_mm, *of_setup[np.isfinite(of_setup)]))
     hint = "; if the dial is at the end of its range, omit this reading"
-    if beyond_sensor or whole or ratio > UNIT_HINT_RATIO:
+    if beyond_sensor or whole_numbers or ratio > UNIT_HINT_RATIO:
         hint = UNIT_HINT
     if ratio > POINT_HINT_RATIO and 2 * n_in_range > of_setup.size:
         hint = "; its decimal point may be misplaced"

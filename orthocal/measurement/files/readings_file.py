@@ -254,13 +254,13 @@ def _read_spreadsheet_table(path: Path, content: bytes, text: str) -> tuple[Tabl
     names = [shorten(" ".join(name.split())) for name in table.header]
     if columns.extra:
         first = columns.extra[0]
-        found = (
+        problem = (
             f"unknown column '{names[first]}'"
             if names[first]
             else f"column {first + 1} has no heading"
         )
         raise SessionError(
-            f"{found}; expected {', '.join(REQUIRED)} and optionally {', '.join(OPTIONAL)}",
+            f"{problem}; expected {', '.join(REQUIRED)} and optionally {', '.join(OPTIONAL)}",
             where=where,
         )
     for i, heading in columns.readings.items():

@@ -387,8 +387,8 @@ def _predict(
             problems = [p for p in contact.problems[start:end] if p]
             if problems or not np.isfinite(on_path).all():
                 lift = "the tip would leave the rod" if not problems else problems[0]
-            elif (excess := np.maximum(low - on_path, on_path - high)).max() > 0.0:
-                largest = f"{on_path[excess.argmax()] / MM:+.1f}".replace("-", "−")
+            elif (beyond := np.maximum(low - on_path, on_path - high)).max() > 0.0:
+                largest = f"{on_path[beyond.argmax()] / MM:+.1f}".replace("-", "−")
                 lift = f"the dial would go {largest} mm"
         expected = float(predicted[end - 1])
         finished.append(replace(stop, lift=lift, expected=expected, path=paths[i].drives))

@@ -200,8 +200,8 @@ def write_program(
     mount = _mount(sensor, session.distinguish_gauge(of_setup.gauge))
     for i, stop in enumerate(stops):
         zero = _zero_to_set(session, motion, stop)
-        setting = f"set the dial to {zero}" if zero else ""
-        actions = mount * (i == 0), setting, read * (stop.role == "reading")
+        set_dial = f"set the dial to {zero}" if zero else ""
+        actions = mount * (i == 0), set_dial, read * (stop.role == "reading")
         instruction = ", then ".join(filter(None, actions))
         instruction = "; ".join(filter(None, (instruction, motion.closing(stop, sensor))))
         side = "; approach " + describe_approach(robot, stop.approach).translate(SIGNS)

@@ -150,7 +150,7 @@ class GaugePosition:
             room = distance - rod.radius - self.rod.radius
             if 0.0 < room < DIAL_LENGTH and aside < 0.5 * DIAL_WIDTH + rod.radius:
                 facing.append((rod, room))
-        return min(facing, key=lambda found: found[1], default=None)
+        return min(facing, key=lambda rod_and_room: rod_and_room[1], default=None)
 
     @property
     def near_hinge(self) -> float | None:
