@@ -361,11 +361,11 @@ def _describe_order(session: Session) -> list[Finding]:
     listed_last, last, times = sessions.labels[-1], sessions.ordered_labels[-1], sessions.times
     if last == listed_last:
         return []
-    if times and times[last] > times[given]:
+    if times and times[last] > times[listed_last]:
         return [describe_wrong_time(listed_last, last)]
     corrections = dict(zip(sessions.labels, sessions.corrections, strict=True))
     kind: Correction = (
-        "compensation" if corrections[given][0] == corrections[last][0] else "offsets"
+        "compensation" if corrections[listed_last][0] == corrections[last][0] else "offsets"
     )
     if kind == "offsets" and session.firmware is not None:
         kind = "settings"

@@ -220,8 +220,8 @@ def _limit_axes(
         limits[k] = max(low, axis[0] - origin[k]), min(high, axis[1] - origin[k])
         if not limits[k][0] < limits[k][1]:
             raise ParameterError(
-                f"[AXIS_{LETTERS[k]}] has the limits {millimetres(axis)} mm; expected a part of the "
-                f"region of the module, {millimetres([low + origin[k], high + origin[k]])} mm",
+                f"[AXIS_{LETTERS[k]}] has the limits {millimetres(axis)} mm; expected a part of "
+                f"the region of the module, {millimetres([low + origin[k], high + origin[k]])} mm",
                 where="--ini",
             )
     return limits
