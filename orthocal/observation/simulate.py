@@ -126,12 +126,7 @@ def simulate_session(
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
     nuisance = nuisance_parameters(plan).parameters
-    drawn = np.zeros(len(nuisance))
-    if nuisance and not exact:
-        # a separate generator, so that the noise does not depend on nuisance parameters
-        normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
-        drawn = normal * [p.prior_std for p in nuisance]
-        drawn = np.where([p.positive for p in nuisance], np.abs(drawn), drawn)
+    drawn = np.zeros(len(nuisance)) if exact else _draw_nuisance(nuisance, seed)
     truth = {p.name: errors.get(p.name, float(v)) for p, v in zip(nuisance, drawn, strict=True)}
     machine_errors = {name: value for name, value in errors.items() if name not in truth}
     entries = predict_readings(
@@ -257,6 +252,17 @@ def _draw_setting(deviations: Array, gauge: Gauge, sigma: float, rng: np.random.
     half = gauge.half_range - SPARE_NOISE * sigma
     low, high = -half - min(deviations, default=0.0), half - max(deviations, default=0.0)
     return round(float(np.clip(shown, low, high)) if low <= 0.0 <= high else shown, 6)
+
+
+def _draw_nuisance(nuisance: Sequence[Parameter], seed: int) -> Array:
+    """Random values of nuisance parameters from their priors, shape (n,), [SI].
+
+    They have a generator of their own, so that the noise does not depend on them.
+    """
+    drawn = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
+    drawn *= np.array([p.prior_std for p in nuisance], dtype=np.float64)
+    positive = np.array([p.positive for p in nuisance], dtype=np.bool_)
+    return np.where(positive, np.abs(drawn), drawn)
 
 
 def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
