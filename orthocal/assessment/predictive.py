@@ -5,7 +5,8 @@ parameters, and the new mountings of the gauges:
 
     y − h(θ, 0) ~ N(0, V),   V = σ² I + J C Jᵀ + G Γ Gᵀ,
 
-with C the covariance of the calibrated parameters and Γ the prior covariance of the mountings.
+with h(θ, ν) the predicted readings and their derivatives J and G with respect to the calibrated
+parameters θ and the mountings ν, the covariance C of θ, and the prior covariance Γ of ν.
 """
 
 from __future__ import annotations
@@ -123,10 +124,10 @@ def _root_of_covariance(calibration: Calibration, fit: Fit) -> Array:
 def _predict_noise(calibration: Calibration, fit: Fit) -> tuple[Array, float]:
     """Noise of the readings of a new session.
 
-    That of a gauge of the calibration is as estimated there. It contains unmodelled errors, without
-    priors always the residuals. Another gauge has its stated noise and the same unmodelled errors.
-    Degrees of freedom of several gauges are combined as Satterthwaite (1946) does. A noise that
-    gauges share counts once.
+    A gauge of the calibration has the noise that was estimated there, which contains unmodelled
+    errors. Without priors it is that of the residuals. Another gauge has its stated noise, plus the
+    unmodelled errors of the calibration. Degrees of freedom of several gauges are combined by
+    Satterthwaite's formula (1946). A noise that gauges share counts once.
 
     Returns:
         Standard deviation of each entry, shape (n_entries,), [m], NaN if unknown; and its degrees
@@ -136,13 +137,13 @@ def _predict_noise(calibration: Calibration, fit: Fit) -> tuple[Array, float]:
     by_residuals = True
     for group, noise in zip(fit.groups, fit.noises.gauges, strict=True):
         stated = group.gauge.sigma, group.gauge.resolution
-        known = [k for k in calibration.gauges if (k.sigma, k.resolution) == stated]
-        if known:
-            noises = [_of_calibration(calibration, k) for k in known]
+        same = [k for k in calibration.gauges if (k.sigma, k.resolution) == stated]
+        if same:
+            noises = [_of_calibration(calibration, k) for k in same]
             variance = sum(s**2 for s, _ in noises) / len(noises)
             dof = sum(dof for _, dof in set(noises))
             by_residuals &= not calibration.prior or all(
-                k.noise.source == "residuals" for k in known
+                k.noise.source == "residuals" for k in same
             )
         else:
             by_residuals, separate, dof = False, noise_floor(*stated), math.inf
@@ -200,7 +201,7 @@ def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> tuple[f
 
     passive, (residual, jacobian) = linearise(fit.solution.theta, fit.solution.passive)
     deviation = residual + jacobian @ ((fit.solution.theta - centre) / scale)
-    z, before, best = least(deviation, jacobian), np.zeros(len(root)), math.inf
+    z, previous, best = least(deviation, jacobian), np.zeros(len(root)), math.inf
     residual = deviation - jacobian @ root @ z
     linear = float(residual @ residual + z @ z)
     reached = residual, jacobian @ root
@@ -211,10 +212,10 @@ def _least_square(fit: Fit, centre: Array, root: Array, sigma: Array) -> tuple[f
         except ClosureError:
             square = math.inf
         if not (square <= best and math.isfinite(square)):  # too far, or a tip misses its rod
-            z = 0.5 * (before + z)
+            z = 0.5 * (previous + z)
             continue
         converged = best - square < SMALL_DECREASE
-        before, best, passive = z, square, closed
+        previous, best, passive = z, square, closed
         reached = residual, jacobian @ root
         if converged:
             break
