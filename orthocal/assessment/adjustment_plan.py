@@ -4,9 +4,10 @@ The amounts a minimise the expected tool error with offsets x that are entered a
 
     min over a, x of  |d + A a − D x|² + Σ |A_i|² s_i²(a_i) + U²,   s_i = `Adjustment.setting_std`
 
-d + A a − D x is the deviation of the tool to first order, after alignment of the workpiece, with d
-that of the calibrated machine. The uncertainty U of d does not depend on a. Amounts are set with
-errors; those of the lever arms are proportional to a.
+d + A a − D x is the deviation of the tool to first order, after alignment of the workpiece. d is
+that of the calibrated machine, A and D are its derivatives with respect to amounts and offsets, and
+A_i is a column of A. The uncertainty U of d does not depend on a. The amount i is set with the
+standard error s_i; its part from the lever arms is proportional to a_i.
 
 Forward selection with exchange finds few adjustments with a large gain. Amounts are rounded to
 steps that can be set. Before figures are reported the loops of the adjusted machine are closed.

@@ -7,6 +7,9 @@ computed and the real position above the bed. A translation s and a rotation γ 
 bed are free, because no print shows them:
 
     min Σ wₖ |f(h(pₖ) + Δ; φ) − Rz(γ) pₖ − s|² + λ Σ z²(first layer)
+
+The sum is over points pₖ with weights wₖ. Rz(γ) is the rotation about z, and z the error of the
+height of the first layer, which has the additional weight λ.
 """
 
 from __future__ import annotations

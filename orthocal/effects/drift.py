@@ -1,6 +1,6 @@
 """Drift of a gauge: the gauge zero of each setup changes linearly with time.
 
-    reading + rate · t
+    displayed reading = reading + rate · t
 
 with the time t since the first reading of the setup.
 """

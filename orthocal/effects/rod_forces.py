@@ -5,8 +5,8 @@ nominal machine, a force f on the tool centre point causes the tension
 
     F = f · ∂p/∂ℓ = f · p_ℓ − λ · g_ℓ,  g_qᵀ λ = p_qᵀ f
 
-with the Jacobians of the tool p and of the closures g from Pinocchio. The closing forces λ balance
-f at the passive joints q.
+Subscripts denote the Jacobians of the tool p and of the closures g, from Pinocchio. The closing
+forces λ balance f at the passive joints q.
 """
 
 from __future__ import annotations

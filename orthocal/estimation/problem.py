@@ -3,8 +3,9 @@
     min over θ, z, q_1..q_K   Σ ρ((y − h(q_k, θ) − z)/σ) + ½ Σ ((θ − mean)/prior std)²
     s.t.                      g(q_k, θ) = 0 for every state k,  lower ≤ θ ≤ upper
 
-A state is a posture under one set of conditions. θ consists of errors of the machine and nuisance
-parameters of the sensors. Known gauge zeros z are 0.
+ρ is the loss and h the predicted reading. A state k is a posture under one set of conditions, with
+the passive coordinates q_k and the loop closures g = 0. θ consists of errors of the machine and
+nuisance parameters of the sensors. Known gauge zeros z are 0.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ closed loops, g(q, θ) ≈ 0, the implicit function theorem gives
 
     dq = −g_q⁻¹ (g + g_θ dθ),  J = h_θ − h_q g_q⁻¹ g_θ
 
+Subscripts denote partial derivatives, and J is the total derivative of h.
+
 All functions accept batches of S machines that differ in their errors, in K postures with any
 number of readings each. One machine is a batch of one. Simulation, solvers, predictive
 distributions, plans and studies use this module.

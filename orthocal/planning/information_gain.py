@@ -1,7 +1,8 @@
 """Reduction of the expected tool error by the readings of one setup.
 
-Let C be the covariance of the state without this setup and T the weight of the state at the tool.
-Readings S of the setup reduce tr(T C) by
+The state is the vector of the errors that setups share: those of the machine, and of common gauges
+and artefacts. Let C be its covariance without this setup, and T its weight at the tool. Readings S
+of the setup reduce tr(T C) by
 
     tr[(V_SS + σ² I)⁻¹ Q_SS],  V = A C Aᵀ + D,  Q = A C T C Aᵀ
 

@@ -6,8 +6,9 @@ column for every free gauge zero, and the prior precision P⁻¹,
     M = S⁻¹ − S⁻¹ X A⁻¹ Xᵀ S⁻¹,  A = Xᵀ S⁻¹ X + σ² P⁻¹
 
 this error is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ, and deleting the reading changes
-the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ (Cook and Weisberg, Residuals and Influence, 1982, 2.2).
-Differences of one setup and cycle share postures: S has a block for each group.
+the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ with the unit vector eᵢ (Cook and Weisberg, Residuals and
+Influence in Regression, 1982, 2.2). Differences of one setup and cycle share postures: S has a
+block for each group.
 
 Deleting a setup s changes the estimate, to first order about the solution, by
 

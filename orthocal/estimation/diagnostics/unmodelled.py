@@ -5,8 +5,9 @@ first order, unmodelled errors θᵤ bias the estimate by B θᵤ,
 
     B = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P⁻¹
 
-The priors of θᵤ therefore add a covariance to the uncertainty of the estimate. Readings are
-scaled to the noise of the first gauge (`CalibrationProblem`).
+with the Jacobians J and Jᵤ of the readings with respect to the estimated parameters and θᵤ, and the
+prior covariance P of the former. The priors of θᵤ therefore add a covariance to the uncertainty of
+the estimate. Readings are scaled to the noise of the first gauge (`CalibrationProblem`).
 """
 
 from __future__ import annotations
