@@ -263,9 +263,10 @@ def expect_deviations(calibration: Calibration, fit: Fit) -> ExpectedDeviations:
     variances follow to first order from those of noise, errors and mountings; the largest is the
     median of the largest of as many independent ones. Without priors unmodelled errors exceed the
     noise and repeat. The deviations are then, as in the paper, the residuals of the calibration,
-    and the effect of the mountings of both sessions: sqrt(rms² + tr(J (G_old + G_new) Jᵀ) / n). Of
-    the same gauges rms is the RMS residual of the calibration, of others in proportion to their
-    noise.
+    and the effect of the mountings of both sessions: sqrt(rms² + tr(J (M_old + M_new) Jᵀ) / n).
+    M_old and M_new are the covariances of the errors from the mountings of each session, and n the
+    number of rows. With the same gauges rms is the RMS residual of the calibration, with others it
+    is in proportion to their noise.
 
     Args:
         calibration: The calibration.

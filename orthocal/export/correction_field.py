@@ -292,9 +292,11 @@ class CorrectionField:
 def command_points(tip: ToolTip, offsets: Array, points: Array) -> tuple[Array, Mapping[int, str]]:
     """Exact points to command, and refused points with the reasons.
 
-        f(c(p) + o − s),  f the nominal forward kinematics,
+        f(c(p) + o − s)
 
-    with s the displacement of the drives by the controller's compensation, as while measuring.
+    f is the nominal forward kinematics and c the inverse kinematics of the calibrated machine. s is
+    the displacement of the drives by the controller's compensation, as while measuring. Two
+    fixed-point steps solve s, which depends on the commanded coordinates.
 
     Args:
         tip: Tip of the tool on the calibrated machine.

@@ -66,6 +66,8 @@ def close_loops(
 
         min ‖W r(x)‖²,  (Jᵀ W² J + μ U²) dx = −Jᵀ W² r,  x ← x + s dx
 
+    r is the residual with the Jacobian J, μ the damping times the cost, and s ≤ 1 shortens a step.
+
     Args:
         evaluate: Residual and Jacobian as a function of the coordinates.
         start: Start values of the coordinates, shape (n,), [m, rad].
