@@ -341,7 +341,14 @@ class ParameterSet:
             ParameterError: If the unit is missing or wrong, or the glob matches nothing.
         """
         glob, unit, factor = split_unit(key)
-        for name in self.select([glob]):
+        try:
+            names = self.select([glob])
+        except ParameterError:
+            keys = [f"{p.name}_{p.edge_unit}" for p in self]
+            keys += [f"*.{key.rpartition('.')[2]}" for key in keys]
+            hint = suggest(key, dict.fromkeys(keys))
+            raise ParameterError(f"'{key}' matches no error parameter{hint}") from None
+        for name in names:
             _check_unit(key, unit, self[name])
         return glob, factor
 

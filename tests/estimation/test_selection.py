@@ -157,6 +157,7 @@ def test_texts_carry_their_units(parameters):
         (read_known, "x_slide.offset_mrad=1", "has the wrong unit"),
         (read_tolerances, "*.offset_mrad=1", "x_slide.offset, which it matches, is in mm"),
         (read_tolerances, "w.offset_mm=1", "matches no error parameter"),
+        (read_tolerances, "offset_mm=1", r"'offset_mm' matches no .* mean \*\.offset_mm"),
         (read_bounds, "x_slide.offset_mm=:", "expected NAME=LOWEST:HIGHEST"),
         (read_bounds, "x_slide.offset_mm=1", "expected NAME=LOWEST:HIGHEST"),
         (read_bounds, "x_slide.offset_mm=a:b", "expected a number"),
