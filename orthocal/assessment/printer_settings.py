@@ -27,7 +27,7 @@ from orthocal.assessment.tool_error import assess_placed
 from orthocal.calibration.assessment_record import ToolErrorSummary
 from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.calibration.refit import restore_covariances
-from orthocal.errors import ClosureError, ExportError
+from orthocal.errors import ClosureError, ExportError, SessionError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, box_workspace
@@ -179,16 +179,17 @@ def fit_firmware(
         tool: Tool error after the calibration; by default that of its assessment.
 
     Raises:
-        ExportError: If the session states no settings, the machine does not reach the workspace, no
-            setup measured the bed, or the best settings are implausible.
+        SessionError: If the session states no settings.
+        ExportError: If the machine does not reach the workspace, no setup measured the bed, or the
+            best settings are implausible.
     """
     from scipy.optimize import least_squares
 
     present = calibration.session.firmware
     if present is None:
-        raise ExportError(
-            "the session states no settings of a firmware (controller.firmware); "
-            "`orthocal import LOG DIRECTORY` makes a session with them"
+        raise SessionError(
+            "the calibrated session states no settings of a firmware (controller.firmware); "
+            f"{firmware} needs a session that `orthocal import LOG DIRECTORY` makes"
         )
     bed = _find_bed(calibration)
     targets, layer_uncertainty = _find_targets(calibration, bed)

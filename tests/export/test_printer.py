@@ -19,6 +19,7 @@ from simulated_printer import Printer, nominal, read_settings, rings, write_log,
 
 from orthocal import (
     ExportError,
+    SessionError,
     assess,
     calibrate,
     draw_errors,
@@ -519,7 +520,7 @@ def test_accuracy_of_a_printer_names_no_offsets(calibrated, tmp_path, without_se
 
 def test_other_sessions_are_refused(root):
     calibration = identified(load_session(root / "examples/raw-cycles"), "offsets")
-    with pytest.raises(ExportError, match=r"controller\.firmware"):
+    with pytest.raises(SessionError, match=r"controller\.firmware"):
         export_calibration(calibration, "klipper", anyway=True)
 
 
