@@ -127,12 +127,12 @@ class ReadingPattern:
         kinds: list[type] = [type(self.sensor), *(type(e) for e in effects)]
         declared = repr([(type(e), self.robot.declared.effects.get(e.name)) for e in effects])
         foreign = any(source_digest(kind) for kind in kinds)
-        whole = (fingerprint(self.robot),) if foreign else ()
+        of_robot = (fingerprint(self.robot),) if foreign else ()
         functions, names = robot_functions(self.robot), self.frames
         at_zero = [self.robot.frame_id(f) for f in names.at_zero]
         others = [self.robot.frame_id(f) for f in (*names.in_posture, *names.in_second)]
         frames = functions.fixed_frames([*at_zero, *others]), functions.fixed_passive(at_zero)
-        return (functions.digest, *frames, declared, *whole)
+        return (functions.digest, *frames, declared, *of_robot)
 
     @cached_property
     def expressions(self) -> tuple[list[ca.SX], list[ca.SX]]:
@@ -168,7 +168,7 @@ def _compile(pattern: ReadingPattern) -> CompiledReading:
 def _build(pattern: ReadingPattern, name: str) -> ca.Function:
     """Build one of the functions of a pattern."""
     inputs, outputs = pattern.expressions
-    second = SECOND_INPUTS[: len(inputs) - len(INPUTS)]
+    second = SECOND_INPUTS if pattern.frames.in_second else []
     if name == FUNCTIONS[0]:
         value = ca.densify(outputs[0])
         return ca.Function("h", inputs, [value], [*INPUTS, *second], ["h"], OPTIONS)

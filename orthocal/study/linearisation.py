@@ -36,7 +36,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.study.random_machines import NO_CONTACT, NOT_ASSEMBLED
+from orthocal.study.random_machines import NO_CONTACT, NOT_CLOSED
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once, require_counts
 from orthocal.units import MM
@@ -145,8 +145,8 @@ class _Prepared:
             errors: True errors of the machines, shape (n_sets, n_free), [SI].
         """
         problem = self.problem
-        readings, _, assembled = problem.simulate(errors)
-        measurable = assembled & np.isfinite(readings).all(axis=1)
+        readings, _, reached = problem.simulate(errors)
+        measurable = reached & np.isfinite(readings).all(axis=1)
         columns: dict[str, list[Any]] = {}
 
         def add(name: str, theta: Array) -> None:
@@ -168,7 +168,7 @@ class _Prepared:
         linear = errors / problem.theta_scale @ self.linearisation.jacobian.T
         nonlinear = (centred - linear) * problem.noise_ratio
         nonlinearity = _largest_difference(nonlinear, problem) / MM
-        reason = np.where(assembled, NO_CONTACT, NOT_ASSEMBLED)
+        reason = np.where(reached, NO_CONTACT, NOT_CLOSED)
         return {
             "status": np.where(measurable, IDENTIFIED, reason).tolist(),
             "reading_mm": np.where(measurable, nonlinearity, np.nan).tolist(),

@@ -41,7 +41,7 @@ NEGLIGIBLE = 1e-9
 CALIBRATED = "calibrated"
 NO_CONTACT = "a tip misses the part it should touch"
 OUT_OF_RANGE = "a reading exceeds the gauge's range"
-NOT_ASSEMBLED = "the machine cannot be assembled in every posture"
+NOT_CLOSED = "the machine cannot reach every posture"
 NOT_CONVERGED = "the calibration does not converge"
 
 Status = NDArray[np.object_]
@@ -294,7 +294,7 @@ class RandomMachines:
         truth, observations = self.truth, self.truth.observations
         theta = np.array(draws) * truth.theta_scale
         entries, _, closed = truth.simulate(theta)
-        status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
+        status = np.where(closed, CALIBRATED, NOT_CLOSED).astype(object)
         for i, rng in enumerate(generators):
             entries[i], _ = show_readings(truth.session, observations, entries[i], rng=rng)
         set_reason(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
@@ -337,7 +337,7 @@ class RandomMachines:
         for tool, (robot, errors) in zip(tools, machines, strict=True):
             if calibrated.size:
                 positions, closed = self.tool(robot, errors[calibrated])
-                set_reason(status, calibrated[~closed], NOT_ASSEMBLED)
+                set_reason(status, calibrated[~closed], NOT_CLOSED)
                 tool[..., calibrated] = positions
         tools[..., status != CALIBRATED] = np.nan
         return [tools[0] - self.tool.positions[..., None], *(tools[0] - t for t in tools[1:])]

@@ -70,15 +70,15 @@ class BatchFunction:
         sparse: Sequence[str] = (),
         key: str | None = None,
     ) -> None:
-        self._given, self._key = function, key
+        self._source, self._key = function, key
         self._matrices, self._sparse = frozenset(matrices), tuple(sparse)
         self._local = threading.local()
 
     @cached_property
     def function(self) -> ca.Function:
         """The function, with dense outputs except the sparse ones."""
-        given = self._given
-        function = given if isinstance(given, ca.Function) else given()
+        source = self._source
+        function = source if isinstance(source, ca.Function) else source()
         return _densified(function, sparse=self._sparse)
 
     @cached_property
