@@ -81,7 +81,10 @@ def export(
     if result.session.firmware is not None:
         _show_settings(result, to, calibration, out)
     if to == "linuxcnc":
-        _note_assumptions(result, options, ini, module="kinematics.ini" in files)
+        module = "kinematics.ini" in files
+        _note_assumptions(result, options, ini, module=module)
+        if joints is not None:
+            _note_home(result, joints, out / ALTERNATIVES[module])
     if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
 
@@ -139,6 +142,27 @@ def _note_assumptions(
             f"half of the backlash in {'the module' if module else 'HOME_OFFSET'}. If it is "
             f"negative, state the signs by {'--ini FILE or ' * (ini is None)}--latched."
         )
+
+
+def _note_home(calibration: orthocal.Calibration, joints: ControllerJoints, lines: Path) -> None:
+    """Note joints whose HOME is outside of the new soft limits: LinuxCNC refuses to move there.
+
+    Args:
+        calibration: The calibration.
+        joints: Joints of the INI file.
+        lines: File with the new lines.
+    """
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+
+    robot = calibration.robot
+    new = zip(robot.drives, read_controller_joints(lines, robot).limits, strict=True)
+    for i, ((drive, (low, high)), home) in enumerate(zip(new, joints.after_homing, strict=True)):
+        if home is not None and not low <= home <= high:
+            limits = " to ".join(f"{v / drive.joint_size:g}" for v in (low, high))
+            put_note(
+                f"HOME of JOINT_{i} is {home / drive.joint_size:g} {drive.joint_unit}, outside of "
+                f"its new limits, {limits} {drive.joint_unit}: change HOME in your INI file, too."
+            )
 
 
 def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:

@@ -321,6 +321,18 @@ def test_a_fragment_of_changes_states_no_home_offset(folder, one, plain):
         assert len(entered[0]) == 3
 
 
+def test_home_beyond_the_new_limits_is_named(folder, one, plain):
+    """HOME of joint 1 is at its limit of 380 mm, which moves with the offset, or far from it."""
+    limit = "[JOINT_1]\nMAX_LIMIT = 380\nHOME = "
+    for home in (380, 200):
+        text = plain.read_text().replace("[JOINT_1]\n", f"{limit}{home}\n")
+        (folder / "limit.ini").write_text(text)
+        done = export(folder, one, f"home-{home}", "--ini", folder / "limit.ini")
+        lines = folder / f"home-{home}/joints.ini"
+        assert read_controller_joints(lines, load_calibration(one).robot).limits[1][1] < 0.38
+        assert ("HOME of JOINT_1 is 380 mm" in done.stderr) == (home == 380)
+
+
 def test_narrower_soft_limits_of_the_file_are_kept(folder, one, plain):
     """They are positions of the slide, which change with the offset; wider ones do not count."""
     own = "[JOINT_1]\nMIN_LIMIT = 160\nMAX_LIMIT = 999\n"

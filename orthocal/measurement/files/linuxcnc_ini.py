@@ -44,6 +44,7 @@ KEYS = frozenset(
         "BACKLASH",
         "COMP_FILE",
         "COMP_FILE_TYPE",
+        "HOME",
         "HOME_LATCH_VEL",
         "HOME_OFFSET",
         "HOME_SEARCH_VEL",
@@ -80,6 +81,8 @@ class ControllerJoints:
     """Offsets of the slides that the comment of exported lines states, [m, rad]; None otherwise."""
     opposed: tuple[str, ...] = ()
     """Sections of joints whose HOME_LATCH_VEL and HOME_SEARCH_VEL have opposite signs."""
+    after_homing: tuple[float | None, ...] = ()
+    """HOME, the position to which each joint moves after homing, [m, rad]; None if not stated."""
 
     @property
     def home_offsets(self) -> tuple[float, ...] | None:
@@ -101,7 +104,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     text = read_text(path, error=ParameterError)
     sections = _read_sections(text, path)
     trajectory = sections.get("TRAJ", {})
-    joints, opposed = [], []
+    joints, opposed, after_homing = [], [], []
     for i, drive in enumerate(robot.drives):
         unit = drive.joint_unit
         with errors_at(f"{path}: [TRAJ]"):
@@ -115,6 +118,8 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
             if (latch or 0) * _read_number(keys, "HOME_SEARCH_VEL") < 0.0:
                 opposed.append(f"[JOINT_{i}]")
             of_joint = _read_limits(keys, drive.joint_unit, drive.joint_size)
+            at_home = _read_number(keys, "HOME") * drive.joint_size
+            after_homing.append(at_home if "HOME" in keys else None)
             joints.append((home, of_joint, latch, trim))
     homes, limits, latched, trims = zip(*joints, strict=True)
     stated = any(latch is not None for latch in latched)
@@ -126,6 +131,7 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         with_homes(trims, [home or 0.0 for home in homes] if known else None),
         None if stated else _read_offsets(text, robot.drives),
         tuple(opposed),
+        tuple(after_homing),
     )
 
 
