@@ -81,10 +81,8 @@ def export(
     if result.session.firmware is not None:
         _show_settings(result, to, calibration, out)
     if to == "linuxcnc":
-        module = "kinematics.ini" in files
-        _note_assumptions(result, options, ini, module=module)
-        if joints is not None:
-            _note_home(result, joints, out / ALTERNATIVES[module])
+        _note_assumptions(result, options, ini, module="kinematics.ini" in files)
+        _note_home(result, joints, out, files)
     if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
 
@@ -144,17 +142,25 @@ def _note_assumptions(
         )
 
 
-def _note_home(calibration: orthocal.Calibration, joints: ControllerJoints, lines: Path) -> None:
+def _note_home(
+    calibration: orthocal.Calibration,
+    joints: ControllerJoints | None,
+    out: Path,
+    files: Mapping[str, str],
+) -> None:
     """Note joints whose HOME is outside of the new soft limits: LinuxCNC refuses to move there.
 
     Args:
         calibration: The calibration.
-        joints: Joints of the INI file.
-        lines: File with the new lines.
+        joints: Joints of the INI file; None without a file.
+        out: Directory of the export.
+        files: The written files by name.
     """
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
-    robot = calibration.robot
+    if joints is None:
+        return
+    robot, lines = calibration.robot, next(out / name for name in ALTERNATIVES if name in files)
     new = zip(robot.drives, read_controller_joints(lines, robot).limits, strict=True)
     for i, ((drive, (low, high)), home) in enumerate(zip(new, joints.after_homing, strict=True)):
         if home is not None and not low <= home <= high:
