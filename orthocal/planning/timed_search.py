@@ -151,17 +151,17 @@ class TimedSearch:
         """Plan with these setups and further ones, exchanged for better ones within a time."""
         with one_thread():
             plan = self.fill(self.search.plan_of(setups), minutes)
-            plan = self._exchange_all(plan, minutes, together=1)
+            plan = self._exchange_all(plan, minutes, count=1)
             if len(plan.setups) > MAX_PAIRED_SETUPS:
                 return plan
-            return self._exchange_all(plan, minutes, together=2)
+            return self._exchange_all(plan, minutes, count=2)
 
-    def _exchange_all(self, plan: PlannedSetups, minutes: float, *, together: int) -> PlannedSetups:
-        """Exchange setups, one or two at a time, until the gain is small."""
+    def _exchange_all(self, plan: PlannedSetups, minutes: float, *, count: int) -> PlannedSetups:
+        """Exchange `count` setups at a time until the gain is small."""
         unimproved: set[tuple[PlannedSetup, ...]] = set()  # no better setups were found for these
         for _ in range(MAX_ROUNDS):
             before = plan.error
-            for old in combinations(plan.setups, together):
+            for old in combinations(plan.setups, count):
                 if old in unimproved or not Counter(old) <= Counter(plan.setups):
                     continue
                 exchanged = self._exchange(plan, old, minutes)

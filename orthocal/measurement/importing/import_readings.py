@@ -207,6 +207,7 @@ def write_import(result: TableImport) -> None:
 
 
 def _check_options(options: TableOptions) -> None:
+    """Refuse an unknown decimal sign, unit or role of a column."""
     for value, expected, option, kind in (
         (options.decimal, get_args(Sign), "--decimal", "decimal sign"),
         (options.unit, tuple(UNITS), "--unit", "unit of readings"),

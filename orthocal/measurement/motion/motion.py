@@ -56,7 +56,6 @@ from orthocal.units import MM
 MOST_STOPS = 2000
 """Largest number of readings in one plan: two weeks of work."""
 
-
 STEP = 5e-3
 """Largest distance between samples of a segment, [m]."""
 
