@@ -21,25 +21,25 @@ class Move:
     end: np.ndarray
     feed: float | None
     """[mm/min]; None for a rapid motion."""
-    center: np.ndarray | None = None
+    centre: np.ndarray | None = None
     normal: np.ndarray | None = None
     angle: float = 0.0
 
     def sample(self, count):
         """Points of the motion, by Rodrigues' rotation about its centre, shape (count, 3)."""
         t = np.linspace(0.0, 1.0, count)[:, None]
-        if self.center is None:
+        if self.centre is None:
             return self.start + t * (self.end - self.start)
-        arm, n = self.start - self.center, self.normal
+        arm, n = self.start - self.centre, self.normal
         phi = self.angle * t
         turned = (
             arm * np.cos(phi) + np.cross(n, arm) * np.sin(phi) + n * (n @ arm) * (1 - np.cos(phi))
         )
-        return self.center + turned + t * n * (n @ (self.end - self.start))
+        return self.centre + turned + t * n * (n @ (self.end - self.start))
 
     @property
     def length(self):
-        points = self.sample(2 if self.center is None else 1001)
+        points = self.sample(2 if self.centre is None else 1001)
         return np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
 
 
@@ -96,24 +96,24 @@ def random_program(seed, *, moves=12, box=40.0, offset=(0.0, 0.0, 0.0), inches=T
             toward -= normal * (normal @ toward)
             arm = radius * toward / np.linalg.norm(toward)
             center_base = offset if arc_absolute else at
-            center = center_base + written(at + arm - center_base, unit)
-            center = np.where(normal > 0, at, center)
+            centre = center_base + written(at + arm - center_base, unit)
+            centre = np.where(normal > 0, at, centre)
             full = rng.random() < 0.2
             angle = 2 * np.pi if full else rng.uniform(0.2, 6.0)
-            end = Move(0, at, at, None, center, normal, sign * angle).sample(2)[1]
+            end = Move(0, at, at, None, centre, normal, sign * angle).sample(2)[1]
             if rng.random() < 0.4:
                 end = end + normal * (rng.uniform(-10, 10) - normal @ at * 0.3)
             end = at + normal * (normal @ (end - at)) if full else end
             exact = base + written(end - base, unit)
             exact = np.where((normal == 0) & full, at, exact)
-            first, last = at - center, exact - center
+            first, last = at - centre, exact - centre
             first, last = (v - normal * (normal @ v) for v in (first, last))
             if not full:
                 turned = np.arctan2(sign * normal @ np.cross(first, last), first @ last)
                 angle = turned % (2 * np.pi)
             turns = int(rng.integers(1, 4)) if rng.random() < 0.2 else 1
             move = Move(
-                number, at, exact, feed, center, normal,
+                number, at, exact, feed, centre, normal,
                 sign * (angle + 2 * np.pi * (turns - 1)),
             )  # fmt: skip
             names = "".join("XYZ"[k] for k in range(3) if not (full and k in (i, j)))
@@ -123,9 +123,9 @@ def random_program(seed, *, moves=12, box=40.0, offset=(0.0, 0.0, 0.0), inches=T
                 if abs(angle - np.pi) > 0.3:
                     axes += f" R{r / unit:.9f}"
                 else:
-                    axes += center_words(center - center_base, i, j, unit)
+                    axes += center_words(centre - center_base, i, j, unit)
             else:
-                axes += center_words(center - center_base, i, j, unit)
+                axes += center_words(centre - center_base, i, j, unit)
             axes += f" P{turns}" if turns > 1 else ""
             end = exact
         program.text.append(f"N{number} {kind} {axes}{feed_word} (move {number})")

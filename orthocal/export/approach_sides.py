@@ -78,9 +78,9 @@ class ApproachSides:
         self._displacement = calibration.displacement
         self._periodic = find_periodic_errors(robot, calibration.errors)
         self._closure = nominal_closure(robot)
-        center = tool_at_zero(robot)
-        half = np.full(center.size, IDENTIFICATION_REGION * robot.characteristic_length)
-        form = find_nominal_form(robot, center, half)
+        centre = tool_at_zero(robot)
+        half = np.full(centre.size, IDENTIFICATION_REGION * robot.characteristic_length)
+        form = find_nominal_form(robot, centre, half)
         self._form = form if isinstance(form, SlidesWithRods) else None
         """Nominal inverse kinematics in closed form, which is faster; None for other machines."""
 

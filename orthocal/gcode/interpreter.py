@@ -18,7 +18,7 @@ from orthocal.gcode.path import (
     Motion,
     Vector,
     arc_about,
-    center_of_radius,
+    centre_of_radius,
 )
 from orthocal.units import INCH, MM
 
@@ -146,7 +146,7 @@ class Modes:
     """Whether the program has set the unit."""
     absolute: bool = True
     """Whether coordinates are absolute (G90)."""
-    centers_absolute: bool = False
+    centres_absolute: bool = False
     """Whether centres of arcs are absolute (G90.1)."""
     feed: float | None = None
     """Feed in units of the program per minute; None if unknown."""
@@ -394,7 +394,7 @@ class Interpreter:
             case "distance":
                 self.modes = replace(modes, absolute=code == 900.0)
             case "arc distance":
-                self.modes = replace(modes, centers_absolute=code == 901.0)
+                self.modes = replace(modes, centres_absolute=code == 901.0)
             case "feed":
                 if code == 950.0:
                     _refuse_code(word)
@@ -542,21 +542,21 @@ class Interpreter:
         turns = words.get("P", 1.0)
         if turns != math.floor(turns) or not 1.0 <= turns <= MOST_TURNS:
             raise GcodeError(f"P is {turns:g}; expected a whole number of turns, 1 to {MOST_TURNS}")
-        centers = [c for c in (CENTERS[i], CENTERS[j]) if c in words]
-        if centers and "R" in words:
-            raise GcodeError(f"found R and {centers[0]}; expected one of them")
+        centres = [c for c in (CENTERS[i], CENTERS[j]) if c in words]
+        if centres and "R" in words:
+            raise GcodeError(f"found R and {centres[0]}; expected one of them")
         if "R" in words:
             radius = words["R"] * modes.unit
-            center = center_of_radius(start, end, radius, plane=modes.plane, clockwise=clockwise)
+            centre = centre_of_radius(start, end, radius, plane=modes.plane, clockwise=clockwise)
         else:
-            if not centers or (modes.centers_absolute and len(centers) < 2):
-                problem = f"only {centers[0]}" if centers else "an arc without a centre"
+            if not centres or (modes.centres_absolute and len(centres) < 2):
+                problem = f"only {centres[0]}" if centres else "an arc without a centre"
                 raise GcodeError(f"found {problem}; expected {CENTERS[i]} and {CENTERS[j]}, or R")
-            base = self.offset if modes.centers_absolute else start
+            base = self.offset if modes.centres_absolute else start
             first, second = (base[k] + words.get(CENTERS[k], 0.0) * modes.unit for k in (i, j))
-            center = (first, second)
+            centre = (first, second)
         return arc_about(
-            start, end, center, plane=modes.plane, clockwise=clockwise, turns=int(turns)
+            start, end, centre, plane=modes.plane, clockwise=clockwise, turns=int(turns)
         )
 
 

@@ -58,7 +58,7 @@ class Arc(NamedTuple):
 
     plane: int
     """Number of the G-word, 17, 18 or 19."""
-    center: tuple[float, float]
+    centre: tuple[float, float]
     """Coordinates of the centre in the plane, [m]."""
     radii: tuple[float, float]
     """Radius at the start and at the end, [m]."""
@@ -101,7 +101,7 @@ class Paths:
         for i, motion in enumerate(motions):
             if motion.arc is not None:
                 arc, (first, second, _) = motion.arc, PLANES[motion.arc.plane]
-                base[i, [first, second]] = arc.center
+                base[i, [first, second]] = arc.centre
                 slope[i, [first, second]] = 0.0
                 radius[i] = arc.radii[0], arc.radii[1] - arc.radii[0]
                 angle[i] = arc.angle, arc.sweep
@@ -178,7 +178,7 @@ class Paths:
 def arc_about(
     start: Vector,
     end: Vector,
-    center: tuple[float, float],
+    centre: tuple[float, float],
     *,
     plane: int,
     clockwise: bool,
@@ -189,7 +189,7 @@ def arc_about(
     Args:
         start: First point, [m].
         end: Last point, [m].
-        center: Coordinates of the centre in the plane, [m].
+        centre: Coordinates of the centre in the plane, [m].
         plane: Number of the G-word, 17, 18 or 19.
         clockwise: Whether the arc is clockwise (G2), seen from the positive end of the normal.
         turns: Number of times that the arc reaches its end.
@@ -198,8 +198,8 @@ def arc_about(
         GcodeError: If the radii at the ends differ, or the centre is at an end.
     """
     i, j, _ = PLANES[plane]
-    first = (start[i] - center[0], start[j] - center[1])
-    last = (end[i] - center[0], end[j] - center[1])
+    first = (start[i] - centre[0], start[j] - centre[1])
+    last = (end[i] - centre[0], end[j] - centre[1])
     r0, r1 = math.hypot(*first), math.hypot(*last)
     if min(r0, r1) < SMALLEST_RADIUS:
         raise GcodeError("the centre of an arc is at one of its ends")
@@ -219,10 +219,10 @@ def arc_about(
     elif sweep == 0.0:
         sweep = 2.0 * math.pi
     sweep += math.copysign(2.0 * math.pi * (turns - 1), sweep)
-    return Arc(plane, center, (r0, r1), angle, sweep)
+    return Arc(plane, centre, (r0, r1), angle, sweep)
 
 
-def center_of_radius(
+def centre_of_radius(
     start: Vector, end: Vector, radius: float, *, plane: int, clockwise: bool
 ) -> tuple[float, float]:
     """Centre of an arc with a radius R, in the plane, [m].

@@ -458,18 +458,18 @@ def interpret(text, folder):
         elif name == "ARC_FEED":
             a, b, ca, cb, turns, height = (float(v) for v in arguments.split(",")[:6])
             order = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}[plane]
-            end, center, normal = np.zeros(3), np.array(at), np.zeros(3)
+            end, centre, normal = np.zeros(3), np.array(at), np.zeros(3)
             end[list(order)] = np.array([a, b, height]) * unit
-            center[list(order[:2])] = np.array([ca, cb]) * unit
+            centre[list(order[:2])] = np.array([ca, cb]) * unit
             normal[order[2]] = 1.0
-            first, last = at - center, end - center
+            first, last = at - centre, end - centre
             sign = np.sign(turns)
             flat = last - normal * (normal @ last)
             angle = np.arctan2(sign * normal @ np.cross(first, flat), first @ flat) % (2 * np.pi)
             if np.linalg.norm(flat - first) < 2e-3 * unit:
                 angle = 2 * np.pi
             angle += 2 * np.pi * (abs(turns) - 1)
-            moves.append(Move(0, at, end, feed, center, normal, sign * angle))
+            moves.append(Move(0, at, end, feed, centre, normal, sign * angle))
             at = end
     return moves
 
@@ -486,7 +486,7 @@ def test_linuxcnc_interpreter_before_and_after_correction(seed, tmp_path):
     text = random_program(1000 + seed, moves=10, inches=False).text
     lines, _ = corrected(text)
     before, after = interpret(text, tmp_path), interpret(lines, tmp_path)
-    assert all(move.center is None for move in after)
+    assert all(move.centre is None for move in after)
     polyline = np.array([move.end for move in after])
     for move in before[1:]:
         dense = bend(move.sample(60))
