@@ -57,8 +57,9 @@ def checks_of_machine(session: Session) -> list[str]:
         "you must home it again, repeat the interrupted setup.",
         f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
         f"controller must show about {joint_list(robot, robot.drive_zero)}. If a number differs by "
-        f"more than {_largest_difference(robot)}, the zero of the joint, a dimension or the "
-        f"direction of counting is wrong.{normal} Correct the zero in the controller (LinuxCNC: "
+        f"more than {_largest_difference(robot)}, which its tolerance and your eye do not explain, "
+        "the zero of the joint, a dimension or the direction of counting is wrong."
+        f"{normal} Correct the zero in the controller (LinuxCNC: "
         f"HOME_OFFSET), or the others in {_dimension_files(robot)}. From now on, drive to the "
         "numbers printed here, not by eye. Travel of the joints: "
         f"{'; '.join(_travel(session))}.",
