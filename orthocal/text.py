@@ -108,6 +108,11 @@ def spans(numbers: Sequence[int], noun: str) -> str:
     return f"{noun if len(numbers) == 1 else f'{noun}s'} {', '.join(words)}{more}"
 
 
+def percent(share: float) -> str:
+    """Share as a whole number of per cent, such as 5 %."""
+    return f"{100.0 * share:.0f} %"
+
+
 def list_some(items: Sequence[str], most: int, *, separator: str = ", ") -> str:
     """First items of a list, and the number of the others."""
     more = f" and {len(items) - most} more" if len(items) > most else ""

@@ -26,6 +26,7 @@ from orthocal.robot.model import (
     coordinate_turns,
     coordinate_units,
 )
+from orthocal.text import percent
 from orthocal.units import DRIVE_UNITS
 
 Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
@@ -335,14 +336,14 @@ class _Path:
         if worst[0] < self._tolerance:
             reason = (
                 "cannot be reached from the mechanical zero without changing the way in "
-                f"which the loops are assembled, {done:.0%} of the way"
+                f"which the loops close, {percent(done)} of the way"
             )
         else:
             geometry = self._geometry.at(np.array([i]), len(self._points))
             reason = (
                 "cannot be reached: the loops stay open by "
-                f"{self._system.describe(last[0], target[0], geometry)}, {done:.0%} of the way "
-                "from the mechanical zero"
+                f"{self._system.describe(last[0], target[0], geometry)}, {percent(done)} of the "
+                "way from the mechanical zero"
             )
         self._refuse(i, reason, float(worst[0]))
 

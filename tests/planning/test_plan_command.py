@@ -198,7 +198,7 @@ def test_other_gauges_without_a_gain_are_not_listed(headline):
     mirror = replace(first, name="a mirror", expected=headline.expected)
     text = summarize(replace(headline, other_gauges=(mirror,)))
     assert "a mirror: " not in text
-    assert "None (a mirror) gains 2%" in text
+    assert "None (a mirror) gains 2 %" in text
     better = replace(second, expected=halve(headline.expected))
     text = summarize(replace(headline, other_gauges=(mirror, better)))
     assert f"The same readings with {second.name}: " in text
@@ -213,7 +213,7 @@ def test_a_number_of_setups_is_proposed_unless_the_plan_is_as_good(headline):
     assert "µm after a second measurement. More setups" in " ".join(sentence.split())
     for factor, minutes in ((0.99, -15.0), (1.01, 1.0)):
         as_good = replace(enough, minutes=enough.minutes + minutes, error=factor * enough.error)
-        assert "setups gain less than 5% an hour" in summarize(replace(headline, stage=as_good))
+        assert "setups gain less than 5 % an hour" in summarize(replace(headline, stage=as_good))
         assert proposed not in summarize(replace(headline, stage=as_good))
     longer = replace(as_good, minutes=enough.minutes + 60.0)
     assert proposed in summarize(replace(headline, stage=longer))

@@ -14,12 +14,13 @@ from orthocal.assessment.adjustment_plan import (
 )
 from orthocal.assessment.wording import joined, name_direction, tool_mm
 from orthocal.assessment.words.entries import describe_compensated
+from orthocal.text import percent
 from orthocal.units import MM, format_fixed
 
 HEADLINES: dict[Judgement, str] = {
     "worthwhile": "Adjust the machine in this order, then enter the offsets and measure again.",
     "small gain": "Do not adjust the machine: adjusting it reduces the expected tool error by "
-    f"less than {WORTHWHILE:.0%}.",
+    f"less than {percent(WORTHWHILE)}.",
     "uncertain gain": "Do not adjust the machine: adjusting it moves the tool by less than the "
     "uncertainty of this calibration. Measure more, then plan again.",
 }

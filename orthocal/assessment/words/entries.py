@@ -21,7 +21,7 @@ from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.robot.model import Drive, drive_keys
 from orthocal.session.points import count_readings
 from orthocal.session.session import Session
-from orthocal.text import capitalised
+from orthocal.text import capitalised, percent
 from orthocal.units import UM, format_fixed
 
 HEADLINES: dict[Verdict, str] = {
@@ -129,7 +129,7 @@ def no_change_needed(
         numbers |= {"now_um": best.now / UM, "best_um": best.entered / UM}
         text = (
             "Keep the active offsets: others would lower the expected tool error by less than "
-            f"{share:.0%}."
+            f"{percent(share)}."
         )
     return note("no change needed", text, "", parameter_places(*drives), **numbers)
 

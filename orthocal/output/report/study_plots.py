@@ -39,6 +39,7 @@ from orthocal.study.bootstrap import BootstrapSummary
 from orthocal.study.linearisation import LinearisationSummary
 from orthocal.study.runner import StudyTable
 from orthocal.study.sensitivity import SensitivitySummary
+from orthocal.text import percent
 from orthocal.units import UM
 
 GREY = "#777777"
@@ -213,7 +214,7 @@ def plot_plan(plan: MeasuringPlan, unit: float, when: str) -> Figure:
                 errors.append(other.expected.reported.rms / unit)
                 axes.plot(other.minutes / HOUR, errors[-1], label=other.name, **look)
     if plan.enough is not None:
-        label = f"another hour gains < {HOURLY_GAIN:.0%}"
+        label = f"another hour gains < {percent(HOURLY_GAIN)}"
         axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
     scale_log(axes, "y", np.array(errors))
     axes.set_xlim(left=0.0)

@@ -49,7 +49,7 @@ from orthocal.sensors.probe import Probe
 from orthocal.sensors.tool_indicator import ToolIndicator
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Reading, Session
-from orthocal.text import capitalised
+from orthocal.text import capitalised, percent
 from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM
 
 FORMS: dict[Criterion, str] = {
@@ -180,8 +180,8 @@ def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
     ]
     if first.lost > SOME_LOST:
         lines.append(
-            f"With offsets within their tolerances the tip misses the rod in {first.lost:.0%} of "
-            "the readings. Enter offsets from a few readings first, or use a blade."
+            f"With offsets within their tolerances the tip misses the rod in {percent(first.lost)} "
+            "of the readings. Enter offsets from a few readings first, or use a blade."
         )
     further = {(f.limit.effect, f.limit.unit): _describe_further(f) for f in plan.further}
     for effect in plan.effects:
@@ -392,18 +392,18 @@ def _when_enough(plan: MeasuringPlan) -> str:
     if enough is None:
         last = plan.curve[-1]
         return (
-            f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {um(last.error)} µm "
-            f"instead of {um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
+            f"More setups gain more than {percent(HOURLY_GAIN)} an hour: expect {um(last.error)} "
+            f"µm instead of {um(plan.stage.error)} µm{_second_measurement(plan, ' after ')} "
             f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)}).{other}"
         )
     as_long = plan.stage.minutes < (1.0 + ALIKE) * enough.minutes
     if as_long and plan.stage.error < (1.0 + ALIKE) * enough.error:
-        return f"Further setups gain less than {HOURLY_GAIN:.0%} an hour."
+        return f"Further setups gain less than {percent(HOURLY_GAIN)} an hour."
     return (
         f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
         f"{um(enough.error)} µm instead of {um(plan.stage.error)} µm"
         f"{_second_measurement(plan, ' after ')}. "
-        f"More setups gain less than {HOURLY_GAIN:.0%} an hour.{other}"
+        f"More setups gain less than {percent(HOURLY_GAIN)} an hour.{other}"
     )
 
 
@@ -433,7 +433,7 @@ def _helps(plan: MeasuringPlan, gains: Sequence[SensorGain]) -> list[str]:
     better = [n for n in names if sizes[n] < (1.0 - NOTICEABLE) * mine]
     texts = [f"The same readings with {n}: {tool_mm(sizes[n])}." for n in better]
     if names and not better:
-        texts.append(f"None ({'; '.join(names)}) gains {NOTICEABLE:.0%}.")
+        texts.append(f"None ({'; '.join(names)}) gains {percent(NOTICEABLE)}.")
     return texts + describe_gains(gains, mine)
 
 
