@@ -175,7 +175,7 @@ def test_an_open_posture_says_mm_and_mrad(orthoglide):
     with pytest.raises(ClosureError, match=r"does not close: open by \S+ mm( and \S+ mrad)?$"):
         orthoglide.close_with_pinocchio([0.9, 0.3, 0.3], orthoglide.reference_passive)
     far = np.array([0.9, 0.3, 0.3])
-    with pytest.raises(ClosureError, match=r"open by \S+ mm( and \S+ mrad)?, \d+% of the way"):
+    with pytest.raises(ClosureError, match=r"open by \S+ mm( and \S+ mrad)?, \d+ % of the way"):
         LoopClosure(orthoglide).close(far)
 
 
