@@ -77,10 +77,10 @@ class Fit:
     noises: NoiseEstimate
     """Noise of a reading of each gauge."""
     prediction: Array
-    """h at the solution, gauge zeros at 0, shape (n_entries,), [m, scaled], see
+    """h at the solution, gauge zeros at 0, shape (n_entries,), [noise-scaled m], see
     `CalibrationProblem`."""
     jacobian: Array
-    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per prior std, scaled]."""
+    """dh/dθ̂ at the solution, shape (n_entries, n_free), [noise-scaled m per prior std]."""
     information: Information
     """Information of the Jacobian."""
     seconds_build: float = 0.0
@@ -112,7 +112,7 @@ class Fit:
 
     @property
     def residual(self) -> Array:
-        """Readings minus predictions and zeros, shape (n_entries,), [m, scaled]."""
+        """Readings minus predictions and zeros, shape (n_entries,), [noise-scaled m]."""
         return _residual(self.program, self.solution, self.prediction)
 
     @property
@@ -143,7 +143,7 @@ class Fit:
         It is NaN if nothing determines the noise.
 
         Args:
-            noise: Standard deviation of a reading, [m, scaled]; by default `sigma`, with
+            noise: Standard deviation of a reading, [noise-scaled m]; by default `sigma`, with
                 which the parameters were estimated.
         """
         return self._to_si(self._posterior(noise).covariance)
@@ -462,7 +462,7 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
 
 
 def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
-    """Residuals with the optimal gauge zeros, shape (n_entries,), [m, scaled]."""
+    """Residuals with the optimal gauge zeros, shape (n_entries,), [noise-scaled m]."""
     problem, o = program.problem, program.problem.observations
     deviation = problem.values - prediction
     if program.options.loss.robust:
@@ -483,7 +483,7 @@ def _scatter(
     Args:
         program: The program.
         linear: dh/dθ̂, shape (n_entries, n_free), and its information.
-        residual: Residuals, zeros eliminated, shape (n_entries,), [m, scaled].
+        residual: Residuals, zeros eliminated, shape (n_entries,), [noise-scaled m].
         sigma: Standard deviation of a reading of the first gauge in the present solution, [m].
         groups: The gauges.
         at_bound: Mask of the parameters at a bound, shape (n_free,).

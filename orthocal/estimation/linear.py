@@ -147,7 +147,7 @@ class LinearProblem:
 
     problem: CalibrationProblem
     residual: Array
-    """y − h, gauge zeros projected out, shape (n_entries,), [m, scaled]."""
+    """y − h, gauge zeros projected out, shape (n_entries,), [noise-scaled m]."""
     jacobian: Array
     """dh/dθ, gauge zeros projected out, shape (n_entries, n_free), [m per prior std,
     scaled]."""

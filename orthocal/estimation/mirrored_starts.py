@@ -22,7 +22,7 @@ from orthocal.arrays import Array, Indices
 
 Predict = Callable[[Array], Array]
 """Function from changes of θ̂, shape (k, n_free), to the readings of S machines after each change,
-shape (S, k, n_entries), [m, scaled]."""
+shape (S, k, n_entries), [noise-scaled m]."""
 
 MAX_DISTANCE = 4.0
 """Largest distance of the stationary point from the nominal value, [prior std]."""
@@ -52,7 +52,7 @@ class MirroredDirections:
     directions: Array
     """Unit vectors v, shape (n_directions, n_free)."""
     curvatures: Array
-    """Norms of c, shape (n_directions,), [m per prior std², scaled]."""
+    """Norms of c, shape (n_directions,), [noise-scaled m per prior std²]."""
 
     def __len__(self) -> int:
         """Number of directions."""

@@ -51,7 +51,7 @@ class CalibrationProblem:
     deviations from the manual alignment. An entry is a single reading; a difference has two.
     Entries are scaled: divided by the ratio of their gauge's noise to that of the first gauge, so
     that all have equal standard deviations. With one gauge the ratio is 1. Docstrings name the unit
-    of scaled readings [m, scaled].
+    of scaled readings [noise-scaled m].
 
     Args:
         session: The session, or several joined ones.
@@ -175,7 +175,7 @@ class CalibrationProblem:
                 (n_nuisance,), [SI].
 
         Returns:
-            Shape (n_entries,), [m, scaled]; NaN out of reach.
+            Shape (n_entries,), [noise-scaled m]; NaN out of reach.
         """
         n, setup = self.n_machine, self.observations.setup
         active = (self.robot.drive_zero - self.session.zero_drives)[setup]
@@ -194,7 +194,7 @@ class CalibrationProblem:
 
     @cached_property
     def values(self) -> Array:
-        """Readings of the entries, shape (n_entries,), [m, scaled]."""
+        """Readings of the entries, shape (n_entries,), [noise-scaled m]."""
         return self.observations.values(self.session.values) / self.noise_ratio
 
     @cached_property
@@ -247,7 +247,7 @@ class CalibrationProblem:
             theta: Free parameters, shape (S, n_free), [SI].
 
         Returns:
-            Readings, shape (S, n_entries), [m, scaled]; passive coordinates, shape
+            Readings, shape (S, n_entries), [noise-scaled m]; passive coordinates, shape
             (S, n_states, n_passive); and a mask of the machines that reach every posture, shape
             (S,). Results of the other machines contain NaN.
         """
@@ -316,7 +316,7 @@ class CalibrationProblem:
                 (S, n_states, n_passive), [m, rad]; solved by default.
 
         Returns:
-            Shape (n_entries,) or (S, n_entries), [m, scaled].
+            Shape (n_entries,) or (S, n_entries), [noise-scaled m].
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
@@ -377,7 +377,7 @@ class CalibrationProblem:
                 of the parameter, for the solvers. "SI": dh/dθ in metres per SI unit.
 
         Returns:
-            Readings, shape (n_entries,), [m, scaled], and Jacobian, shape (n_entries,
+            Readings, shape (n_entries,), [noise-scaled m], and Jacobian, shape (n_entries,
             n_free); both with S in front for a batch.
 
         Raises:

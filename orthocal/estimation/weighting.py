@@ -291,7 +291,7 @@ def leverages(
     """Leverage of each entry, shape (n_entries,); the sum is the effective number of parameters.
 
     Args:
-        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std, scaled].
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [noise-scaled m per prior std].
         observations: The entries.
         covariance: Covariance of θ̂, shape (n_free, n_free).
         sigma: Standard deviation of a reading of the first gauge, [m].

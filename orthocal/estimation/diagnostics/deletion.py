@@ -155,10 +155,10 @@ def _sigma_without_rows(fit: Fit, contributions: Array) -> tuple[Array, float]:
 
     Args:
         fit: The fit.
-        contributions: Contribution of each row to Σ r², shape (n_rows,), [m², scaled].
+        contributions: Contribution of each row to Σ r², shape (n_rows,), [noise-scaled m²].
 
     Returns:
-        Standard deviations, shape (n_rows,), [m, scaled], and degrees of freedom.
+        Standard deviations, shape (n_rows,), [noise-scaled m], and degrees of freedom.
     """
     noise = fit.noise
     if noise.source != "residuals" or fit.loss.robust:

@@ -70,7 +70,7 @@ class UnmodelledErrors:
     """Mask of the errors whose tolerances the scale multiplies, shape (n_unmodelled,)."""
     jacobian: Array
     """∂h/∂θ̂ᵤ: change of the readings by one prior standard deviation of each error, zeros
-    eliminated, shape (n_entries, n_unmodelled), [m, scaled]."""
+    eliminated, shape (n_entries, n_unmodelled), [noise-scaled m]."""
 
 
 @cached_per_robot
@@ -126,7 +126,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
 
     Returns:
         ∂h/∂θ̂ᵤ per stated prior standard deviation of each error, zeros eliminated, shape
-        (n_entries, n_names), [m, scaled].
+        (n_entries, n_names), [noise-scaled m].
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])

@@ -41,7 +41,7 @@ class BatchSolution:
     theta: Array
     """Free parameters, shape (S, n_free), [SI]."""
     zeros: Array
-    """Gauge zeros, shape (S, n_zeros), [m, scaled]."""
+    """Gauge zeros, shape (S, n_zeros), [noise-scaled m]."""
     objective: Array
     """Objectives (see `Solution`), shape (S,)."""
     at_bound: NDArray[np.int8]
@@ -68,7 +68,7 @@ class BatchSolver:
         """Solve the problem for each set of readings.
 
         Args:
-            values: Readings of the entries, shape (S, n_entries), [m, scaled].
+            values: Readings of the entries, shape (S, n_entries), [noise-scaled m].
             sigma: Standard deviation of one reading, [m].
 
         Raises:
@@ -229,12 +229,12 @@ class _BatchTask:
         """Evaluate solutions of sets of readings.
 
         Args:
-            y: Readings, shape (S, n_entries), [m, scaled].
+            y: Readings, shape (S, n_entries), [noise-scaled m].
             theta: θ̂, shape (S, n_free).
-            reading: Predicted readings, shape (S, n_entries), [m, scaled].
+            reading: Predicted readings, shape (S, n_entries), [noise-scaled m].
 
         Returns:
-            Zeros, shape (S, n_zeros), [m, scaled]; objectives, shape (S,); and a mask of
+            Zeros, shape (S, n_zeros), [noise-scaled m]; objectives, shape (S,); and a mask of
             the sets that are finite and not far from their prior, shape (S,).
         """
         _, zeros, cost = self.residual((y - reading) / self.sigma)

@@ -75,12 +75,12 @@ class Expressions:
     nuisance: dict[str, ca.MX]
     """Nuisance parameters among `errors`, as deviations from their manual alignment, [SI]."""
     zeros: ca.MX
-    """Gauge zeros, shape (n_zeros,), [m, scaled]."""
+    """Gauge zeros, shape (n_zeros,), [noise-scaled m]."""
     readings: ca.MX
     """Predicted readings with gauge zeros, in the order of `problem.observations`, shape
-    (n_entries,), [m, scaled]."""
+    (n_entries,), [noise-scaled m]."""
     residuals: ca.MX
-    """Measured minus predicted readings, shape (n_entries,), [m, scaled]."""
+    """Measured minus predicted readings, shape (n_entries,), [noise-scaled m]."""
     passive: dict[str, ca.MX]
     """Passive coordinates q of each state by name, shape (n_passive,), [m, rad]."""
     closures: dict[str, ca.MX]
@@ -239,7 +239,7 @@ class NonlinearProgram(Program):
         Args:
             theta: Free parameters, shape (n_free,), [SI]; the active offsets by default.
             sigma: Standard deviation of one reading, [m].
-            values: Readings of the entries, shape (n_entries,), [m, scaled]; the
+            values: Readings of the entries, shape (n_entries,), [noise-scaled m]; the
                 session's by default.
             passive: Start values of the passive coordinates, shape (n_states, n_passive),
                 [m, rad].
@@ -311,7 +311,7 @@ class NonlinearProgram(Program):
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            values: Readings of the entries, shape (n_entries,), [m, scaled]; the
+            values: Readings of the entries, shape (n_entries,), [noise-scaled m]; the
                 session's by default.
             excluded: Indices of the entries to exclude.
             width_factor: Factor on the width of a robust loss.

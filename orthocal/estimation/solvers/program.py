@@ -27,7 +27,7 @@ class Solution:
     theta: Array
     """Free parameters, shape (n_free,), [SI]."""
     zeros: Array
-    """Gauge zeros, shape (n_zeros,), [m, scaled]."""
+    """Gauge zeros, shape (n_zeros,), [noise-scaled m]."""
     passive: Array
     """Passive coordinates, shape (n_states, n_passive), [m, rad]."""
     objective: float
@@ -51,7 +51,7 @@ class SolverInput:
     sigma: float
     """Standard deviation of one reading, [m]."""
     values: Array
-    """Readings of the entries, shape (n_entries,), [m, scaled]."""
+    """Readings of the entries, shape (n_entries,), [noise-scaled m]."""
     weights: Array
     """Weights of the entries, shape (n_entries,): 1, or `EXCLUDED_WEIGHT` for excluded ones."""
     start: Array
@@ -105,7 +105,7 @@ class Program(ABC):
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            values: Readings of the entries, shape (n_entries,), [m, scaled]; the
+            values: Readings of the entries, shape (n_entries,), [noise-scaled m]; the
                 session's by default.
             start: Start values of the free parameters, shape (n_free,), [SI]; the active offsets by
                 default.
@@ -135,7 +135,7 @@ class Program(ABC):
         )
 
     def _readings(self, values: ArrayLike) -> Array:
-        """Readings of the entries, shape (n_entries,), [m, scaled].
+        """Readings of the entries, shape (n_entries,), [noise-scaled m].
 
         Raises:
             ValueError: If a reading is missing, or their number is wrong.
