@@ -148,7 +148,7 @@ def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
 def _recorded_information(
     calibration: Calibration, problem: CalibrationProblem
 ) -> tuple[Array, Information]:
-    """Predictions, shape (n_entries,), [m of the first gauge], and information at the estimate."""
+    """Predictions, shape (n_entries,), [noise-scaled m], and information at the estimate."""
     theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
     prediction, jacobian = problem.predict_and_jacobian(theta)
     return prediction, decompose(jacobian, problem.observations)

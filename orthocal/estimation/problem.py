@@ -49,8 +49,8 @@ class CalibrationProblem:
     The free parameters are errors of the machine, then nuisance parameters of the sensors, as
     deviations from the manual alignment. An entry is a single reading; a difference has two.
     Readings are divided by the ratio of their gauge's noise to that of the first gauge, so that all
-    have equal standard deviations. Their unit is "metres of the first gauge": metres if there is
-    only one gauge.
+    have equal standard deviations. Their unit is written "noise-scaled m". It is the metre for the
+    first gauge, so for all readings of a session with one gauge.
 
     Args:
         session: The session, or several joined ones.
@@ -70,7 +70,7 @@ class CalibrationProblem:
         free: Names of the free parameters, in the order of the Jacobian's columns.
         fixed: Known values of parameters by name, [SI].
         observations: Setup, posture and zero of each entry.
-        noise_ratio: The argument.
+        noise_ratio: The argument `noise_ratio`.
         theta_scale: Prior standard deviations of the free parameters, shape (n_free,), [SI].
         prior_precision: 1 for a free parameter with a prior, otherwise 0, shape (n_free,),
             [1 per prior std²].
@@ -174,9 +174,14 @@ class CalibrationProblem:
                 (n_nuisance,), [SI].
 
         Returns:
-            Shape (n_entries,), [m of the first gauge]; NaN out of reach.
+            Shape (n_entries,), [noise-scaled m]; NaN where offsets of a single setup make the
+            posture unreachable.
+
+        Raises:
+            ClosureError: If a posture cannot be reached with the active offsets of the session.
         """
         n, setup = self.n_machine, self.observations.setup
+        # a setup may state active offsets of its own
         active = (self.robot.drive_zero - self.session.zero_drives)[setup]
         result = np.empty(self.observations.size)
         for offsets in np.unique(active, axis=0):
@@ -193,7 +198,7 @@ class CalibrationProblem:
 
     @cached_property
     def values(self) -> Array:
-        """Readings of the entries, shape (n_entries,), [m of the first gauge]."""
+        """Readings of the entries, shape (n_entries,), [noise-scaled m]."""
         return self.observations.values(self.session.values) / self.noise_ratio
 
     @cached_property
@@ -246,7 +251,7 @@ class CalibrationProblem:
             theta: Free parameters, shape (S, n_free), [SI].
 
         Returns:
-            Readings, shape (S, n_entries), [m of the first gauge]; passive coordinates, shape
+            Readings, shape (S, n_entries), [noise-scaled m]; passive coordinates, shape
             (S, n_states, n_passive); and a mask of the machines that reach every posture, shape
             (S,). Results of the other machines contain NaN.
         """
@@ -315,7 +320,7 @@ class CalibrationProblem:
                 (S, n_states, n_passive), [m, rad]; solved by default.
 
         Returns:
-            Shape (n_entries,) or (S, n_entries), [m of the first gauge].
+            Shape (n_entries,) or (S, n_entries), [noise-scaled m].
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
@@ -376,11 +381,12 @@ class CalibrationProblem:
                 of the parameter, for the solvers. "SI": dh/dθ in metres per SI unit.
 
         Returns:
-            Readings, shape (n_entries,), [m of the first gauge], and Jacobian, shape (n_entries,
+            Readings, shape (n_entries,), [noise-scaled m], and Jacobian, shape (n_entries,
             n_free); both with S in front for a batch.
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
+            LinAlgError: If a posture is singular.
             ParameterError: If the units are unknown, or theta has another size.
         """
         size = np.atleast_1d(theta).shape[-1]
@@ -467,7 +473,13 @@ def build_problem(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     tolerance_scale: ToleranceScale = AS_STATED,
 ) -> CalibrationProblem:
-    """Build the problem of a session; arguments are those of `select_parameters`."""
+    """Build the problem of a session.
+
+    The other arguments and the exceptions are those of `select_parameters`.
+
+    Raises:
+        RobotError: If closure rows of the robot are linearly dependent.
+    """
     selection = select_parameters(
         session.robot.parameters,
         model=model,

@@ -80,13 +80,13 @@ class _Prepared:
 
     fit: Fit
     residuals: Array
-    """Residuals rescaled to the noise, with mean 0, shape (n,), [m of the first gauge]."""
+    """Residuals rescaled to the noise, with mean 0, shape (n,), [noise-scaled m]."""
     cycles: tuple[tuple[Indices, ...], ...]
     """Entries of each cycle of each setup, with the same order of places in all cycles."""
     program: BatchSolver
 
     def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
-        """Resampled readings of the session, shape (n_entries,), [m of the first gauge]."""
+        """Resampled readings of the session, shape (n_entries,), [noise-scaled m]."""
         fitted, measured = self.fit.prediction, self.fit.problem.values
         if by == "residuals":
             return np.asarray(fitted + rng.choice(self.residuals, size=fitted.size))

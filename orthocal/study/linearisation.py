@@ -204,7 +204,7 @@ class _Prepared:
         """One Gauss-Newton step for each machine; NaN if its readings cannot be predicted.
 
         Args:
-            readings: Readings, shape (n_sets, n_entries), [m of the first gauge].
+            readings: Readings, shape (n_sets, n_entries), [noise-scaled m].
             theta: Parameters, shape (n_sets, n_free), [SI].
         """
         problem = self.problem

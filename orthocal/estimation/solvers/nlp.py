@@ -208,7 +208,7 @@ class ProgramFunctions:
             p: Parameters of the program.
 
         Returns:
-            Shape (n_entries,), [m of the first gauge].
+            Shape (n_entries,), [noise-scaled m].
         """
         shared = self._shared_calls(x[: self.problem.n_machine])
         values, entries = [], []

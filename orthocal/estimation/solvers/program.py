@@ -16,6 +16,9 @@ from orthocal.arrays import Array
 from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 
+CONVERGED = "Solve_Succeeded"
+"""Status of a solution, in the terms of Ipopt; any other status is an error."""
+
 EXCLUDED_WEIGHT = 1e-9
 """Weight of excluded readings: negligible, but it determines their gauge zeros."""
 
@@ -27,19 +30,20 @@ class Solution:
     theta: Array
     """Free parameters, shape (n_free,), [SI]."""
     zeros: Array
-    """Gauge zeros, shape (n_zeros,), [m of the first gauge]."""
+    """Gauge zeros, shape (n_zeros,), [noise-scaled m]."""
     passive: Array
     """Passive coordinates, shape (n_states, n_passive), [m, rad]."""
     objective: float
     """Objective: Σ ρ((y − h − z)/σ) plus the contribution of the prior."""
     status: str
-    """Status in the terms of Ipopt."""
+    """Status in the terms of Ipopt (see `CONVERGED`)."""
     iterations: int
     """Number of iterations."""
     hessian: Hessian
     """Hessian of the solver; always Gauss-Newton for solvers other than Ipopt."""
     closure: float
-    """Largest remaining closure residual, rotations times characteristic length, [m]."""
+    """Largest remaining closure residual of Ipopt, rotations times characteristic length, [m]; 0
+    for other solvers, which close the loops."""
     at_bound: NDArray[np.int8]
     """-1 for a parameter at its lower bound, 1 at its upper bound, else 0, shape (n_free,)."""
 
@@ -51,7 +55,7 @@ class SolverInput:
     sigma: float
     """Standard deviation of one reading, [m]."""
     values: Array
-    """Readings of the entries, shape (n_entries,), [m of the first gauge]."""
+    """Readings of the entries, shape (n_entries,), [noise-scaled m]."""
     weights: Array
     """Weights of the entries, shape (n_entries,): 1, or `EXCLUDED_WEIGHT` for excluded ones."""
     start: Array
@@ -61,7 +65,7 @@ class SolverInput:
     prescribed: Mapping[int, float]
     """Indices of free parameters, mapped to prescribed values, [SI]."""
     mirrored: bool = True
-    """Start from mirror images of the solution, too."""
+    """True to start from mirror images of the solution, too."""
 
 
 class Program(ABC):
@@ -105,7 +109,7 @@ class Program(ABC):
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
+            values: Readings of the entries, shape (n_entries,), [noise-scaled m]; the
                 session's by default.
             start: Start values of the free parameters, shape (n_free,), [SI]; the active offsets by
                 default.
@@ -135,7 +139,7 @@ class Program(ABC):
         )
 
     def _readings(self, values: ArrayLike) -> Array:
-        """Readings of the entries, shape (n_entries,), [m of the first gauge].
+        """Readings of the entries, shape (n_entries,), [noise-scaled m].
 
         Raises:
             ValueError: If a reading is missing, or their number is wrong.
