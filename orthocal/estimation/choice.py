@@ -130,7 +130,7 @@ class Choice:
 def resolve_choice(
     choice: Choice | str | None, session: Session | None, *, default_model: str | None = None
 ) -> Choice:
-    """Choice of the user, otherwise of the session, otherwise the default model.
+    """Choice of the user; otherwise the model of the session; otherwise the default model.
 
     Args:
         choice: A choice, or the name of a model.
@@ -138,7 +138,7 @@ def resolve_choice(
         default_model: Model if neither states one; the complete model by default.
 
     Raises:
-        ParameterError: If nothing is chosen and the sessions state different models.
+        ParameterError: If no model is chosen and the joined sessions state different ones.
         TypeError: If an argument has a wrong type.
     """
     require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
@@ -162,7 +162,7 @@ def resolve_choice(
 def _require_used(
     tolerances: Mapping[str, float], parameters: ParameterSet, selection: Selection
 ) -> None:
-    """Refuse tolerances of sums that are not free: only the tolerances of their terms are used."""
+    """Refuse tolerances of sums that are not free, for which those of their terms are used."""
     used = {*selection.names, *parameters.elementary}
     for key in tolerances:
         glob, _ = parameters.read_glob(key)
@@ -176,7 +176,7 @@ def _require_used(
 def _known_in_si(
     known: Mapping[str, KnownWithTolerance], parameters: ParameterSet
 ) -> dict[str, KnownWithStd]:
-    """Known values, or (value, prior standard deviation), by name, [SI]."""
+    """Known values, or pairs of value and prior standard deviation, by name, [SI]."""
     result: dict[str, KnownWithStd] = {}
     for key, value in known.items():
         with errors_at("known"):

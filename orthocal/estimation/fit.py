@@ -77,8 +77,8 @@ class Fit:
     noises: NoiseEstimate
     """Noise of a reading of each gauge."""
     prediction: Array
-    """h at the solution, gauge zeros at 0, shape (n_entries,), [noise-scaled m], see
-    `CalibrationProblem`."""
+    """Predicted readings h at the solution, gauge zeros at 0, shape (n_entries,), [noise-scaled m]
+    (see `CalibrationProblem`)."""
     jacobian: Array
     """dh/dθ̂ at the solution, shape (n_entries, n_free), [noise-scaled m per prior std]."""
     information: Information
@@ -160,7 +160,8 @@ class Fit:
         result is the largest k_i of the errors of the machine. It is NaN if a noise is unknown.
 
         Args:
-            separate: Whether residuals do not contribute to the noise (see `covariance`).
+            separate: True if the noise is estimated without residuals, as a `noise` that is passed
+                to `covariance`.
         """
         groups, problem = self.groups, self.problem
         dofs = [noise.dof for noise in self.noises.gauges]
@@ -189,7 +190,7 @@ class Fit:
         return self._to_si(self._posterior().prior_covariance(self.problem.selection.scaled))
 
     def _posterior(self, noise: float | None = None) -> Posterior:
-        """Posterior of θ̂; for `noise` see `covariance`."""
+        """Posterior of θ̂, for the argument `noise` of `covariance`."""
         gain, noise_factor = 1.0, 1.0
         if self.loss.robust:
             used = self.problem.observations.size - self.noise.residual_dof
@@ -230,7 +231,7 @@ def fit_problem(
     program: Program | None = None,
     rounds: int = MAX_SIGMA_ROUNDS,
 ) -> Fit:
-    """Solve a problem, with sigma from the readings if they determine it.
+    """Solve a problem and estimate sigma, the standard deviation of a reading of the first gauge.
 
     Args:
         problem: The problem.
@@ -276,27 +277,27 @@ def _solve_with_noise(
     initial = initial_sigmas(problem.session, problem.observations)
     several = len(groups) > 1
     solution, sigma = _solve_first(program, linear, groups, start)
-    iterations, mirrors_compared = solution.iterations, True
+    iterations, sides_compared = solution.iterations, True
     for remaining in reversed(range(rounds)):
         evaluation = _evaluate(program, solution, sigma, groups, initial)
         estimated, ratio = floored_sigma(evaluation.noises.common), evaluation.noises.ratio
-        change = estimated / sigma * (ratio / problem.noise_ratio)
+        change = estimated / sigma * (ratio / problem.noise_ratio)  # of each entry's sigma
         converged = not math.isfinite(estimated) or _agrees(change)
         converged = converged or not (several or _depends_on_sigma(program))
-        if (converged and mirrors_compared) or not remaining:
+        if (converged and sides_compared) or not remaining:
             break
         if not converged:
             sigma = estimated
         if not converged and several:
             problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
-        # the better sides of mirrored directions may depend on sigma
-        mirrors_compared = converged or not len(problem.mirrored)
+        # the better sides of mirrored directions may depend on sigma: compare them again at the end
+        sides_compared = converged or not len(problem.mirrored)
         solution = program.solve(
             sigma=sigma,
             start=solution.theta,
             start_passive=solution.passive,
-            mirrored=mirrors_compared,
+            mirrored=sides_compared,
         )
         iterations += solution.iterations
     noises = evaluation.noises
@@ -352,7 +353,7 @@ def _solve_first(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evaluation:
-    """Predictions and noise of a solution; quantities are those of `Fit`."""
+    """Predictions and noise of a solution, with the fields of `Fit`."""
 
     prediction: Array
     jacobian: Array
@@ -385,7 +386,7 @@ def floored_sigma(noise: Noise) -> float:
 def require_reachable(
     problem: CalibrationProblem, solution: Solution, *, options: SolverOptions
 ) -> None:
-    """Refuse a solution that cannot reach a posture, as wrong readings can cause.
+    """Refuse a solution that cannot reach a posture. Wrong readings can lead to one.
 
     Args:
         problem: The problem.
@@ -411,17 +412,17 @@ def _depends_on_sigma(program: Program) -> bool:
 
 
 def _agrees(change: ArrayLike) -> bool:
-    """True if factors between estimates and previous ones are near 1."""
+    """True if all ratios of new to previous standard deviations are near 1."""
     return bool(np.abs(np.asarray(change) - 1.0).max() < SIGMA_TOLERANCE)
 
 
 def _linearised_sigma(
     program: Program, linearisation: LinearProblem, groups: Sequence[GaugeReadings]
 ) -> tuple[float, float]:
-    """Sigma of the linearised problem, [m], which usually suffices for one exact solution.
+    """Sigma of the linearised problem, [m], which the exact solution usually confirms.
 
     With few residual degrees of freedom a stated initial sigma is used, unless the residuals reject
-    it. An estimate from them would count nonlinearity as noise and allow larger residuals.
+    it. An estimate from the residuals would count nonlinearity as noise.
 
     Returns:
         Sigma of the first solution, and sigma from the linearised residuals. They differ only if
@@ -478,11 +479,12 @@ def _scatter(
     groups: Sequence[GaugeReadings],
     at_bound: Mask | None = None,
 ) -> Scatter:
-    """Readings and residuals that show the noise.
+    """Readings and residuals from which the noise is estimated.
 
     Args:
         program: The program.
-        linear: dh/dθ̂, shape (n_entries, n_free), and its information.
+        linear: dh/dθ̂, shape (n_entries, n_free), [noise-scaled m per prior std], and its
+            information.
         residual: Residuals, zeros eliminated, shape (n_entries,), [noise-scaled m].
         sigma: Standard deviation of a reading of the first gauge in the present solution, [m].
         groups: The gauges.
@@ -495,7 +497,7 @@ def _scatter(
     )
     if len(groups) > 1:
         used = leverages(jacobian, o, posterior.covariance, sigma)
-    else:  # only the sum counts
+    else:  # for one gauge only the sum of the leverages counts
         used = np.full(o.size, posterior.effective_parameters / o.size)
     return Scatter(
         groups=groups,

@@ -26,23 +26,24 @@ TWELVE_ROWS = tuple(
 )
 """Names of the rows of equation (8): direction, leg and sign.
 
-"+" is the reading in the maximum posture minus that in the zero posture, "-" the reading in the
-minimum posture minus that in the zero posture. The last block is (Δx_z, Δz_x).
+Row "xy+" is Δx_y: the reading in direction x on leg y in the maximum posture, minus that in the
+mechanical zero. "-" is the minimum posture instead. The last block is (Δx_z, Δz_x).
 """
 
-SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
-"""Names of the rows of the reduced system, maximum minus minimum: direction and leg, ordered as in
-Table 1 of the paper."""
+SMALLEST_NORM = 1e-12
+"""Smallest norm of the residuals by which a problem with bounds is divided, [m], or [1] with a
+prior."""
 
-LEAST_RESIDUAL = 1e-12
-"""Least scale of the residuals in a problem with bounds, [m], or [1] with a prior."""
+SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
+"""Names of the rows of the reduced system, which are differences between the maximum and the
+minimum posture, in the order of the paper's Table 1."""
 
 
 def displacement_angle(displacement: float, *, length: float) -> float:
     """Angle α by which the other two legs incline when the tool moves along an axis.
 
-    sin α = displacement/L. The displacement to the minimum posture is ρ_min − L, with the lowest
-    coordinate ρ_min of the slides. Its angle α_min is negative (the paper prints asin(ρ_min/L)).
+    With the drive coordinate ρ_min of the minimum posture, α_min = asin((ρ_min − L)/L) is negative.
+    The paper prints asin(ρ_min/L), which is a misprint.
 
     Args:
         displacement: Signed displacement of the tool from the mechanical zero, [m].
@@ -71,8 +72,8 @@ def leg_parallelism_matrix(
 
         Δy_x = c Δρ_x + b Δρ_y,  b = sin α,  c = (1 − μ + sin α) tan α
 
-    Δy_x is the difference of readings in y on leg x, and Δρ are the offsets. With μ = 0.5 this is
-    equation (7). A row of the reduced system is maximum minus minimum.
+    Δy_x is a difference of readings in direction y on leg x, Δρ_x the offset of drive x, and α the
+    result of `displacement_angle`. With μ = 0.5 this is equation (7).
 
     Args:
         length: Leg length L, [m].
@@ -95,7 +96,8 @@ def leg_parallelism_matrix(
         b = np.sin(alpha)
         coefficients[sign] = (b, (1.0 - fraction_from_tcp + b) * np.tan(alpha))
 
-    def row(direction: str, leg: str, sign: str) -> Array:
+    def row(name: str) -> Array:
+        direction, leg, sign = tuple(name)
         b, c = coefficients[sign]
         result = np.zeros(3)
         result["xyz".index(leg)] = c
@@ -103,14 +105,14 @@ def leg_parallelism_matrix(
         return result
 
     if rows == 12:
-        return np.array([row(name[0], name[1], name[2]) for name in TWELVE_ROWS])
-    return np.array([row(name[0], name[1], "+") - row(name[0], name[1], "-") for name in SIX_ROWS])
+        return np.array([row(name) for name in TWELVE_ROWS])
+    return np.array([row(name + "+") - row(name + "-") for name in SIX_ROWS])
 
 
 def twelve_row_covariance() -> Array:
     """Covariance of the twelve differences for readings of variance 1, shape (12, 12).
 
-    Both differences of one setup share the reading in the zero posture: [[2, 1], [1, 2]].
+    Both differences of one setup share the reading in the mechanical zero: [[2, 1], [1, 2]].
     """
     same_setup = np.array([[a[:2] == b[:2] for b in TWELVE_ROWS] for a in TWELVE_ROWS])
     return same_setup.astype(np.float64) + np.eye(len(TWELVE_ROWS))
@@ -130,7 +132,8 @@ def invert_equation_8(matrix: ArrayLike, *, covariance: ArrayLike | None = None)
     a = np.asarray(matrix, dtype=np.float64)
     if np.linalg.matrix_rank(a, rtol=RANK_THRESHOLD) < 3:
         raise NotIdentifiableError(
-            "the rows do not determine the three offsets", parameters=("Δρ_x", "Δρ_y", "Δρ_z")
+            "the rows do not determine the three offsets",
+            parameters=("x_slide.offset", "y_slide.offset", "z_slide.offset"),
         )
     if covariance is None:
         return np.asarray(np.linalg.pinv(a))
@@ -147,15 +150,16 @@ class LinearProblem:
 
     problem: CalibrationProblem
     residual: Array
-    """y − h, gauge zeros projected out, shape (n_entries,), [noise-scaled m]."""
+    """Measured minus predicted readings y − h, gauge zeros eliminated, shape (n_entries,),
+    [noise-scaled m] (see `CalibrationProblem`)."""
     jacobian: Array
-    """dh/dθ, gauge zeros projected out, shape (n_entries, n_free), [m per prior std,
-    scaled]."""
+    """dh/dθ̂, with θ̂ the free parameters in prior standard deviations, gauge zeros eliminated,
+    shape (n_entries, n_free), [noise-scaled m per prior std]."""
     information: Information
     """Information of the Jacobian."""
 
     def solve(self, *, sigma: float, use: Mask | None = None) -> Array:
-        """First-order solution by least squares with the prior and bounds of the problem.
+        """Solve the linearised problem by least squares with its prior and bounds.
 
         Args:
             sigma: Standard deviation of one reading, [m]; used only with a prior.
@@ -168,7 +172,7 @@ class LinearProblem:
         problem = self.problem
         rows = slice(None) if use is None else use
         jacobian, residual = self.jacobian[rows], self.residual[rows]
-        if len(jacobian) > 2 * problem.n_free:  # R of QR has the same normal equations, fewer rows
+        if len(jacobian) > 2 * problem.n_free:  # R of J = QR: same least squares, fewer rows
             r = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
             jacobian, residual = r[:, :-1], r[:, -1]
         reference = problem.active_theta / problem.theta_scale
@@ -183,7 +187,8 @@ class LinearProblem:
         if ((step < lower) | (step > upper)).any():
             from scipy.optimize import lsq_linear
 
-            unit = max(float(np.linalg.norm(residual)), LEAST_RESIDUAL)  # its tolerance is absolute
+            # the tolerance of lsq_linear is absolute
+            unit = max(float(np.linalg.norm(residual)), SMALLEST_NORM)
             options = {"bounds": (lower, upper), "method": "bvls", "tol": 1e-15}
             step = lsq_linear(jacobian / unit, residual / unit, **options).x
         return np.asarray((reference + step) * problem.theta_scale)
@@ -209,15 +214,17 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
 
 
 def require_finite(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
-    """Refuse predictions and derivatives that are not finite, as of a tip that misses its rod.
+    """Refuse predicted readings and derivatives that are not finite.
+
+    They are not finite if a tip does not touch its rod.
 
     Args:
         problem: The problem.
-        prediction: Predicted readings, shape (n_entries,), [m].
-        jacobian: Their derivatives, shape (n_entries, n_free).
+        prediction: Predicted readings, shape (n_entries,), [noise-scaled m].
+        jacobian: Derivatives of the readings, shape (n_entries, n).
 
     Raises:
-        SessionError: If a prediction or a derivative is not finite; names setup and posture.
+        SessionError: If a number is not finite; names setup and posture of the first one.
     """
     bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
     if not bad.size:

@@ -33,7 +33,13 @@ MAX_CENTRE_STEPS = 100
 """Largest number of steps of a search for a centre."""
 
 CENTRE_TOLERANCE = 1e-11
-"""Last step of a search for a centre, [standard deviations]."""
+"""Step of a search for a centre below which it has converged, [standard deviations]."""
+
+MAX_SCALE_STEPS = 200
+"""Largest number of fixed-point steps for a robust scale."""
+
+SCALE_TOLERANCE = 1e-10
+"""Relative change of a robust scale below which it has converged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +72,7 @@ class Loss:
             r: Residuals, array or expression of any shape, [standard deviations].
             width: k as an expression; `width` by default.
         """
-        # not k² (√… − 1), which loses all digits of a small r
+        # equal to k² (√… − 1), which loses all digits of a small r
         return r**2 / (1.0 + self._root(r, width)) if self.robust else 0.5 * r**2
 
     def influence(self, r: Values, width: Values | None = None) -> Values:
@@ -103,7 +109,7 @@ class Loss:
             return np.asarray(total, dtype=np.float64)
 
         result = sums(values) / sums(np.ones_like(values))
-        if not np.isfinite(values).all():  # a reading that does not exist
+        if not np.isfinite(values).all():  # a sensor has no reading: the cost is NaN anyway
             return result
         low, high = np.full(count, np.inf), np.full(count, -np.inf)
         np.minimum.at(low, group, values)
@@ -117,6 +123,7 @@ class Loss:
             # Newton step if the gradient decreases fast enough, otherwise bisection
             decreasing = np.abs(gradient) < 0.5 * last_gradient
             last_gradient = np.abs(gradient)
+            # the curvature of huge residuals may be 0 after rounding
             newton = result + gradient / np.maximum(sums(self.curvature(residual)), 1e-300)
             inside = decreasing & (newton >= low) & (newton <= high)
             trial = np.where(inside, newton, 0.5 * (low + high))
@@ -127,10 +134,10 @@ class Loss:
         return result
 
     def gain(self, r: Array, *, used: float) -> float:
-        """Sensitivity of the estimate to the readings: corrected mean of ρ''(r); 1 for squares.
+        """Mean of ρ''(r), corrected for the number of fitted parameters; 1 for squares.
 
-        The correction for few residuals divides by 1 + (p/n) var ρ''/(mean ρ'')² (Huber, Robust
-        Statistics, 1981, section 7.6).
+        It is divided by 1 + (p/n) var ρ''/(mean ρ'')² (Huber, Robust Statistics, 1981, section
+        7.6).
 
         Args:
             r: Residuals, shape (n,), [standard deviations].
@@ -160,21 +167,22 @@ class Loss:
         if not self.robust or dof <= 0.0:
             return float(residual @ residual)
         scale = start
-        for _ in range(200):
+        for _ in range(MAX_SCALE_STEPS):
             mean_square = float(np.sum(self.influence(residual / scale) ** 2)) / dof
             new = scale * math.sqrt(mean_square / self.normal_square)
-            if new == 0.0 or abs(new / scale - 1.0) < 1e-10:
+            if new == 0.0 or abs(new / scale - 1.0) < SCALE_TOLERANCE:
                 return new**2 * dof
             scale = new
         return scale**2 * dof
 
 
 SQUARES = Loss()
+"""Loss function of least squares."""
 
 
 @lru_cache(maxsize=16)
 def _normal_square(width: float) -> float:
-    """Mean of ρ'(z)² for a standard normal z, by quadrature."""
+    """Mean of ρ'(z)² for a standard normal z, by Gauss-Hermite quadrature."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(120)
     values = nodes**2 / (1.0 + (nodes / width) ** 2)
     return float(weights @ values / weights.sum())

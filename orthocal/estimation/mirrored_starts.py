@@ -38,11 +38,12 @@ MIN_CURVATURE_RATIO = 2.0
 optimum, or optima that differ by less than the noise."""
 
 NEAR = 0.5
-"""Distance from the stationary point below which a solution may be on neither side, [prior std]."""
+"""Distance from the stationary point below which a solution counts as between both sides,
+[prior std]."""
 
 MAX_COMBINED = 4
-"""Largest number of directions of which all combinations of sides are tried; of more, at most two
-change sides at once."""
+"""Largest number of directions of which all combinations of sides are tried. Of more directions, at
+most two change sides at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +87,7 @@ def find_mirrored_directions(
     for axes, slope, curvature in zip(
         *(np.split(v, parts) for v in (coordinates, slopes, curvatures)), strict=True
     ):
+        # estimate of the largest curvature along any unit vector, mixed derivatives included
         largest = len(axes) * np.linalg.norm(curvature, axis=1).max()
         rotation, singular = _principal_axes(slope)
         rotated = rotation[singular <= (MAX_DISTANCE + MAX_SLOPE) * largest] @ axes
@@ -93,19 +95,19 @@ def find_mirrored_directions(
             continue
         slope, curvature = (v[0] for v in _slopes_and_curvatures(predict, rotated))
         distance, norm = _stationary(slope, curvature), np.linalg.norm(curvature, axis=1)
-        remaining = np.linalg.norm(slope + distance[:, None] * curvature, axis=1)
+        slope_there = np.linalg.norm(slope + distance[:, None] * curvature, axis=1)
         mirrored = (norm > MIN_CURVATURE) & (np.abs(distance) <= MAX_DISTANCE)
-        mirrored &= remaining <= MAX_SLOPE * norm
+        mirrored &= slope_there <= MAX_SLOPE * norm
         directions.append(rotated[mirrored])
         norms.append(norm[mirrored])
     return MirroredDirections(np.concatenate(directions), np.concatenate(norms))
 
 
 def mirrored_starts(predict: Predict, theta: Array, directions: Array) -> Array:
-    """Start values with some directions mirrored, shape (n_starts, S, n_free).
+    """Start values θ̂ with some directions mirrored, shape (n_starts, S, n_free).
 
-    They are at least one prior standard deviation from the stationary point. Where θ̂ is near it,
-    both sides are starts.
+    They are at least one prior standard deviation from the stationary point. If a solution is near
+    this point, both sides are starts.
 
     Args:
         predict: Readings of the S machines.
@@ -146,7 +148,7 @@ def _principal_axes(slopes: Array) -> tuple[Array, Array]:
 
 
 def _stationary(slopes: Array, curvatures: Array) -> Array:
-    """Distance of the stationary points along each direction, shape (..., n_directions)."""
+    """Distance −a·c/c·c to the stationary point along each direction, shape (..., n_directions)."""
     square = np.maximum((curvatures**2).sum(axis=-1), np.finfo(np.float64).tiny)
     distance: Array = -(slopes * curvatures).sum(axis=-1) / square
-    return np.nan_to_num(distance)
+    return np.nan_to_num(distance)  # 0 if a sensor has no reading after a change

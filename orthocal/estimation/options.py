@@ -37,15 +37,14 @@ class SolverOptions:
     Args:
         solver: `ipopt`, `variable-projection` or `linearised`.
         hessian: Hessian of the Lagrangian for Ipopt: `exact`, or `gauss-newton` without the
-            curvature of readings and closures. If the latter does not converge, the exact one is
-            tried, for sessions of up to 2000 readings.
+            curvature of readings and closures. If Gauss-Newton does not converge, the exact
+            Hessian is tried, for sessions of up to 2000 readings.
         tolerance: Largest optimality error (`tol` of Ipopt), for parameters in prior standard
-            deviations. Multiplied by n/20 000 for n > 20 000 readings. Rounding errors of the
-            gradient are about 1e-7 for readings of 0.3 m with a noise of 5 µm.
+            deviations. It is multiplied by n/20 000 for n > 20 000 readings. Rounding errors of
+            the gradient are about 1e-7 for readings of 0.3 m with a noise of 5 µm.
         closure_tolerance: Largest scaled closure residual in Ipopt, in units of 1 mm.
         max_iterations: Largest number of iterations of Ipopt (`max_iter`) and of variable
-            projection. Sets of readings that are solved in a batch have up to 30 common iterations
-            before.
+            projection. Before that, a batch of sets of readings has up to 30 common iterations.
         print_level: Output of Ipopt, 0 (none) to 12.
         loss: Loss function of standardised residuals.
         ipopt: Further options by their names in Ipopt, such as {"mu_strategy": "adaptive"}. They
@@ -104,6 +103,6 @@ def _is_positive(value: object) -> bool:
 def _require_one_of(
     value: object, names: tuple[str, ...], option: str, error: type[Exception]
 ) -> None:
-    """Require that the value of an option is one of some names."""
+    """Refuse a value of an option that is not one of the names."""
     if value not in names:
         raise error(f"the {option} is {value!r}; expected one of {', '.join(names)}")

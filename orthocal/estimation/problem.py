@@ -49,9 +49,9 @@ class CalibrationProblem:
 
     The free parameters are errors of the machine, then nuisance parameters of the sensors, as
     deviations from the manual alignment. An entry is a single reading; a difference has two.
-    Entries are scaled: divided by the ratio of their gauge's noise to that of the first gauge, so
-    that all have equal standard deviations. With one gauge the ratio is 1. Docstrings name the unit
-    of scaled readings [noise-scaled m].
+    Readings are divided by the ratio of their gauge's noise to that of the first gauge, so that all
+    have equal standard deviations. Their unit is written "noise-scaled m". It is the metre for the
+    first gauge, so for all readings of a session with one gauge.
 
     Args:
         session: The session, or several joined ones.
@@ -71,7 +71,7 @@ class CalibrationProblem:
         free: Names of the free parameters, in the order of the Jacobian's columns.
         fixed: Known values of parameters by name, [SI].
         observations: Setup, posture and zero of each entry.
-        noise_ratio: The argument.
+        noise_ratio: The argument `noise_ratio`.
         theta_scale: Prior standard deviations of the free parameters, shape (n_free,), [SI].
         prior_precision: 1 for a free parameter with a prior, otherwise 0, shape (n_free,),
             [1 per prior std²].
@@ -175,9 +175,14 @@ class CalibrationProblem:
                 (n_nuisance,), [SI].
 
         Returns:
-            Shape (n_entries,), [noise-scaled m]; NaN out of reach.
+            Shape (n_entries,), [noise-scaled m]; NaN where offsets of a single setup make the
+            posture unreachable.
+
+        Raises:
+            ClosureError: If a posture cannot be reached with the active offsets of the session.
         """
         n, setup = self.n_machine, self.observations.setup
+        # a setup may state active offsets of its own
         active = (self.robot.drive_zero - self.session.zero_drives)[setup]
         result = np.empty(self.observations.size)
         for offsets in np.unique(active, axis=0):
@@ -382,6 +387,7 @@ class CalibrationProblem:
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
+            LinAlgError: If a posture is singular.
             ParameterError: If the units are unknown, or theta has another size.
         """
         size = np.atleast_1d(theta).shape[-1]
@@ -468,7 +474,13 @@ def build_problem(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     tolerance_scale: ToleranceScale = AS_STATED,
 ) -> CalibrationProblem:
-    """Build the problem of a session; arguments are those of `select_parameters`."""
+    """Build the problem of a session.
+
+    The other arguments and the exceptions are those of `select_parameters`.
+
+    Raises:
+        RobotError: If closure rows of the robot are linearly dependent.
+    """
     selection = select_parameters(
         session.robot.parameters,
         model=model,

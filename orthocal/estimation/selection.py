@@ -31,6 +31,10 @@ KnownWithTolerance = float | tuple[float, float]
 COMPLETE_MODELS = ("full", "complete")
 """Names of complete models, in order of preference."""
 
+LARGEST_KNOWN_RATIO = 100.0
+"""Ratio of a known value to its prior standard deviation above which it is a length or an angle of
+the machine instead of an error."""
+
 
 def complete_model(parameters: ParameterSet) -> str:
     """Name of a robot's complete model; the largest model if none has such a name."""
@@ -40,17 +44,12 @@ def complete_model(parameters: ParameterSet) -> str:
     return max(parameters.models, key=lambda m: len(parameters.select_model(m)))
 
 
-LARGEST_KNOWN_RATIO = 100.0
-"""Ratio of a known value to its prior standard deviation above which it is a length or an angle of
-the machine instead of an error."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
     """Free parameters of a problem, with priors and bounds."""
 
     label: str
-    """Model and added patterns."""
+    """Model and added patterns, as on the command line."""
     parameters: tuple[Parameter, ...]
     """Free parameters, with the priors of this selection."""
     prior: Mask
@@ -185,7 +184,10 @@ def _find_stds(
     prior_stds: Mapping[str, float],
     tolerance_scale: ToleranceScale,
 ) -> dict[str, float]:
-    """Scaled prior standard deviations of free parameters, those of the robot by default, [SI]."""
+    """Prior standard deviations of free parameters, times the tolerance scale, [SI].
+
+    Those of the robot are the default.
+    """
     stds = {n: parameters[n].prior_std for n in names}
     for glob, value in prior_stds.items():
         with errors_at("tolerances"):
@@ -307,12 +309,12 @@ def read_bounds(
 
 
 def _number(text: str, where: str, name: str) -> float:
-    """Number of a text such as KEY=VALUE."""
+    """Number that a text such as KEY=VALUE states for its key."""
     return parse_number(text.strip(), where=where, name=name, error=ParameterError)
 
 
 def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> list[str]:
-    """Free parameters that a glob matches, all in one unit."""
+    """Names of the free parameters that a glob matches; refuses none, or several units."""
     matches = [n for n in parameters.select([glob]) if n in free]
     if not matches:
         raise ParameterError(f"'{glob}' matches no free parameter")
@@ -361,7 +363,7 @@ def _refuse_length(value: float, parameter: Parameter) -> None:
 
 
 def _require_finite(value: float, name: str) -> float:
-    """Known value of a parameter, refused if it is not finite."""
+    """Known value of a parameter; refuses a value that is not finite."""
     if not math.isfinite(value):
         raise ParameterError(f"the known value of '{name}' is {value}; expected a finite number")
     return float(value)

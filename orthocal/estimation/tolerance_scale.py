@@ -40,6 +40,7 @@ SCALE_RATIO = 30.0 ** (1.0 / 85.0)
 
 
 def trial_scales(lowest: float, highest: float) -> Array:
-    """Tolerance scales that are compared: powers of SCALE_RATIO within limits, 1 among them."""
+    """Trial values of the tolerance scale: powers of SCALE_RATIO from lowest to highest."""
+    # rounded, so that a limit that is a power itself is among them
     first, last = (round(math.log(v) / math.log(SCALE_RATIO), 9) for v in (lowest, highest))
     return np.asarray(SCALE_RATIO ** np.arange(math.ceil(first), math.floor(last) + 1))

@@ -60,7 +60,7 @@ def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeR
 def with_repeatability(
     groups: Sequence[GaugeReadings], problem: CalibrationProblem
 ) -> tuple[GaugeReadings, ...]:
-    """The gauges with the scatter of their repeated cycles."""
+    """Entries of the gauges, with the scatter of their repeated cycles."""
     o, values = problem.observations, problem.values * problem.noise_ratio
     return tuple(replace(g, repeatability=_repeatability(values, o, g.entries)) for g in groups)
 
@@ -159,7 +159,7 @@ class NoiseEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Readings and residuals that show the noise; all arrays have the shape (n_entries,)."""
+    """Readings and residuals from which the noise is estimated; arrays are (n_entries,)."""
 
     groups: Sequence[GaugeReadings]
     """The gauges."""
@@ -170,9 +170,9 @@ class Scatter:
     residual: Array
     """Residuals, gauge zeros projected out, [m]."""
     used: Array
-    """Leverages, parts of the effective number of parameters."""
+    """Leverages, whose sum is the effective number of parameters."""
     sigma: Array
-    """Standard deviations in the present solution, [m]."""
+    """Standard deviations that weighted the entries in the present solution, [m]."""
 
     def estimate(self, initial: Array) -> NoiseEstimate:
         """Noise of each gauge.
@@ -209,11 +209,11 @@ class Scatter:
         return self.pool(self.groups, self.sigma).scaled(first)
 
     def pool(self, groups: Sequence[GaugeReadings], unit: Array) -> Noise:
-        """Noise of the readings of several gauges together, [unit].
+        """Common noise of the readings of several gauges, as a multiple of units.
 
         Args:
             groups: The gauges.
-            unit: Unit of each entry, shape (n_entries,), [m].
+            unit: Length by which each entry is divided, shape (n_entries,), [m].
         """
         o, chosen = self.observations, np.logical_or.reduce([g.entries for g in groups])
         cycles = [(*g.repeatability, float(unit[g.entries][0])) for g in groups]
@@ -232,7 +232,7 @@ class Scatter:
         for g in groups:
             sigmas[g.entries] = g.gauge.sigma or 0.0
             resolutions[g.entries] = g.gauge.resolution or 0.0
-        # the rounding of one of several gauges is no limit for another without a stated noise
+        # without stated noise, the rounding of one gauge is no lower limit for another
         has_floor = stated or len(groups) == 1
         return estimate_noise(
             repeatability=(scatter, cycles_dof),
@@ -258,11 +258,13 @@ def _count_estimated_ratios(noises: Sequence[Noise], few: Sequence[int]) -> int:
         few: Indices of the gauges that share one factor.
     """
     is_estimated = [n.source in ("cycles", "residuals") for n in noises]
+    # the gauges that share one factor count as one, -1
     estimates = {-1 if i in few else i for i, estimated in enumerate(is_estimated) if estimated}
-    return len(estimates) - all(is_estimated)
+    return len(estimates) - all(is_estimated)  # if all are, one of them is the reference
 
 
 def _root_mean_square(values: Array) -> float:
+    """RMS of values."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -274,7 +276,8 @@ def _repeatability(values: Array, o: Observations, entries: Mask) -> tuple[float
 def _median_repeatability(values: Array, o: Observations, of_gauge: Mask) -> float:
     """Median over the setups of a gauge of the scatter of repeated cycles, [m].
 
-    Squares are divided by the median of χ²/ν (Wilson and Hilferty, 1931).
+    Squares of setups with ν degrees of freedom are divided by the median of χ²/ν (Wilson and
+    Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
     """
     squares = []
     for setup in np.unique(o.setup[of_gauge]):

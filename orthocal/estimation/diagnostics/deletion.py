@@ -1,14 +1,14 @@
 """Deletion diagnostics: readings and setups compared with the prediction from all others.
 
-Deleting a reading is equivalent to adding an unknown error to it. With y ~ (X θ, σ² S), X with a
-column for every free gauge zero, and the prior precision P⁻¹,
+Deleting a reading is equivalent to adding an unknown error to it. Readings y have the mean X θ and
+the covariance σ² S. X has a column for every free gauge zero. With the prior precision P⁻¹ and
 
     M = S⁻¹ − S⁻¹ X A⁻¹ Xᵀ S⁻¹,  A = Xᵀ S⁻¹ X + σ² P⁻¹
 
-this error is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ, and deleting the reading changes
-the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ with the unit vector eᵢ (Cook and Weisberg, Residuals and
-Influence in Regression, 1982, 2.2). Differences of one setup and cycle share postures: S has a
-block for each group.
+the error of reading i is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ. Deleting the reading
+changes the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ, with the unit vector eᵢ (Cook and Weisberg, Residuals and
+Influence in Regression, 1982, 2.2). S is 1 for single readings. Differences of one setup and cycle share
+postures, so that S has a block for each of these groups.
 
 Deleting a setup s changes the estimate, to first order about the solution, by
 
@@ -66,7 +66,7 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     """First-order deletion diagnostics of every row."""
     problem, count = fit.problem, fit.problem.observations.plus.size
     sigma, n = fit.noise.sigma, fit.problem.n_machine
-    if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
+    if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):  # no noise to compare with
         zeros = np.zeros(count)
         return Diagnostics(np.full(count, np.nan), zeros, zeros.astype(np.int64), np.inf)
     information = Information(_weighted_jacobian(fit)) if fit.loss.robust else fit.information
@@ -176,8 +176,8 @@ def cross_validate_setups(fit: Fit) -> Array:
     """Prediction errors of every row from all other setups (leave-one-out cross-validation).
 
     Returns:
-        Measured minus predicted reading with the best gauge zeros, shape (n_rows,), [m,
-        scaled]; NaN if the other setups do not determine the parameters.
+        Measured minus predicted reading with the best gauge zeros, shape (n_rows,),
+        [noise-scaled m]; NaN if the other setups do not determine the parameters.
     """
     problem, o = fit.problem, fit.problem.observations
     errors = np.full(o.plus.size, np.nan)

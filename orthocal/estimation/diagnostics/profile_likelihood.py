@@ -54,7 +54,7 @@ def profile_interval(
         )
     std = math.sqrt(float(fit.inverse_normal()[index, index]))
     factor = uncertainty / std if std > 0.0 else coverage_factor(noise.dof)
-    std = std or float(fit.problem.theta_scale[index])
+    std = std or float(fit.problem.theta_scale[index])  # 0 at a bound
     low, high = (_find_end(fit, index, factor, std, side) for side in (-1.0, 1.0))
     value, selection = float(fit.solution.theta[index]), fit.problem.selection
     return (
@@ -64,12 +64,12 @@ def profile_interval(
 
 
 def _find_end(fit: Fit, index: int, factor: float, std: float, side: float) -> float:
-    """End of the interval, where 2 (F − F̂) = factor², or the bound before it.
+    """End of the interval, where 2 (F(θᵢ) − F(θ̂)) = q², or the bound before it.
 
     Args:
         fit: The solved problem.
         index: Index of the parameter.
-        factor: The factor q.
+        factor: Factor q.
         std: Standard deviation s, or at a bound the prior one, [SI].
         side: -1 for the lower end, 1 for the upper end.
     """
@@ -80,7 +80,7 @@ def _find_end(fit: Fit, index: int, factor: float, std: float, side: float) -> f
     to_bound = abs(bound - centre)
 
     def excess(distance: float) -> float:
-        """√(2 (F − F̂)) − factor at a distance from the optimum, [SI]."""
+        """√(2 (F(θᵢ) − F(θ̂))) − q at a distance from the optimum, [SI]."""
         solution = fit.program.solve(
             sigma=sigma,
             start=best.theta,
@@ -90,6 +90,7 @@ def _find_end(fit: Fit, index: int, factor: float, std: float, side: float) -> f
         increase = max(solution.objective - optimum.objective, 0.0)  # a decrease is rounding
         return math.sqrt(2.0 * increase) - factor
 
+    # the first trial is just outside the interval of a linear problem
     inside, outside, step = 0.0, None, 1.2 * factor * std
     for _ in range(MAX_TRIALS):
         trial = min(inside + step, to_bound)

@@ -19,9 +19,13 @@ class ResidualRow(FileRecord):
     """Row of a session's readings: measured = nominal + deviation = predicted + residual."""
 
     setup: str
+    """Name of the setup."""
     posture: str
+    """Name of the posture."""
     minus: Annotated[str, Field(min_length=1)] | None
+    """Name of the second posture of a difference, otherwise None."""
     cycle: Count
+    """Number of the reading among those of its posture."""
     measured: Number
     """Measured reading, [m]."""
     nominal: Number
@@ -31,9 +35,9 @@ class ResidualRow(FileRecord):
     predicted: Number
     """Prediction of the calibrated machine, [m]."""
     line: Count | None
-    """Line of readings.csv."""
+    """Line of the CSV file, None if the readings are not from a file."""
     file: str | None
-    """CSV file, if it is not the file of the session."""
+    """Path of the CSV file, if it is not that of the session."""
     studentised: NumberOrNaN
     """Studentised deleted residual; NaN if the other rows do not predict it."""
     influence: Number
@@ -76,7 +80,7 @@ def rows_by_setup(rows: Iterable[ResidualRow]) -> dict[str, list[ResidualRow]]:
 
 
 def largest_first(rows: Iterable[ResidualRow]) -> list[ResidualRow]:
-    """Rows sorted by the size of their residuals."""
+    """Rows by descending magnitude of the residual."""
     return sorted(rows, key=lambda row: -abs(row.residual))
 
 

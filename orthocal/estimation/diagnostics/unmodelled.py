@@ -39,11 +39,11 @@ class UnmodelledEffect(FileRecord):
     """Prior standard deviation of each error with the tolerance scale, shape (n_unmodelled,),
     [SI]."""
     leakage: Matrix
-    """B of the module and of docs/mathematics.md: bias of the machine's free parameters per unit
-    of each unmodelled error, shape (n_machine, n_unmodelled), [SI per SI]."""
+    """Matrix B of docs/mathematics.md: bias of the machine's free parameters per unit of each
+    unmodelled error, shape (n_machine, n_unmodelled), [SI per SI]."""
     residual_rms: Number
-    """Expected RMS of the rows' residuals due to unmodelled errors within their priors, [m of the
-    first gauge]."""
+    """Expected RMS of the rows' residuals due to unmodelled errors with their priors,
+    [noise-scaled m]."""
     residual_dof: Number
     """Effective degrees of freedom of these residuals (Satterthwaite, 1946)."""
 
@@ -77,8 +77,8 @@ class UnmodelledErrors:
 def machine_errors(robot: Robot) -> tuple[str, ...]:
     """Names of all errors of a machine, in the robot's order.
 
-    These are the errors of the model `full`, and the complete errors that are drive scales or
-    errors of closure frames.
+    These are the errors of the model `full`, all scale errors of drives and all errors of closure
+    frames.
     """
     parameters = robot.parameters
     names = set(parameters.select_model(FULL_MODEL))
@@ -171,7 +171,7 @@ def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[Unmodelled
 
 
 def _effective_dof(matrix: Array) -> float:
-    """Effective degrees of freedom (tr SᵀS)²/tr (SᵀS)² of |S t|² for a standard normal t."""
+    """Effective degrees of freedom of |S t|² for a standard normal t: (tr SᵀS)²/tr (SᵀS)²."""
     square = matrix.T @ matrix
     total = float(np.trace(square)) ** 2
     return total / float((square**2).sum()) if total > 0.0 else 0.0

@@ -1,1 +1,1 @@
-"""Solvers of a calibration problem, side by side: each a file, each checks the others."""
+"""Solvers of a calibration problem, which tests compare with each other."""

@@ -25,10 +25,10 @@ MAX_STEPS = 30
 """Largest number of common iterations."""
 
 MAX_STEP_SIZE = 100.0
-"""Sets with longer steps are solved one by one, [prior std]."""
+"""Largest step of a parameter, [prior std]; sets with longer steps are solved one by one."""
 
 MAX_JACOBIAN_NUMBERS = 2**21
-"""Largest count of numbers in the Jacobians of the sets that are solved together."""
+"""Largest number of elements of all Jacobians of the sets that are solved together."""
 
 MAX_BATCH_STATES = 4096
 """Largest number of states of the sets that are solved together."""
@@ -104,7 +104,10 @@ class BatchSolver:
     def _solve_part(
         self, shared: _BatchTask, y: Array, solution: BatchSolution, part: slice
     ) -> None:
-        """Solve some sets by common Gauss-Newton steps, and fill their part of the solution."""
+        """Solve some sets by common Gauss-Newton steps, and fill their part of the solution.
+
+        Sets that do not converge are marked as `solved_alone`.
+        """
         problem, sigma = self.problem, shared.sigma
         theta = shared.linearised_solutions(y)
         passive = problem.active_passive + shared.linear.follow(theta - shared.start)
@@ -135,10 +138,7 @@ class BatchSolver:
 
 
 class _BatchTask:
-    """Vectorised `Task` for many sets of readings.
-
-    tests/estimation/solvers/test_batch.py compares both.
-    """
+    """Vectorised `Task` (module `subproblem`) for many sets of readings."""
 
     def __init__(self, problem: CalibrationProblem, options: SolverOptions, sigma: float) -> None:
         self.problem, self.loss, self.sigma = problem, options.loss, sigma
@@ -189,13 +189,13 @@ class _BatchTask:
     ) -> tuple[Array, NDArray[np.int8]]:
         """Gauss-Newton steps s = (JᵀWJ + P⁻¹)⁻¹ (Jᵀρ' − P⁻¹ (θ̂ − mean)) within the bounds.
 
-        W holds the weights ρ'(r)/r, J the rows minus the weighted mean of those with the same
-        free zero.
+        W are the weights ρ'(r)/r and P⁻¹ is the prior precision. J is dh/dθ̂ in σ; from each row
+        the weighted mean of the rows with the same free zero is subtracted.
 
         Args:
             theta: θ̂, shape (S, n_free).
             residual: Residuals r, shape (S, n_entries), [σ].
-            jacobian: dh/dθ̂, shape (S, n_entries, n_free), [m per prior std].
+            jacobian: dh/dθ̂, shape (S, n_entries, n_free), [noise-scaled m per prior std].
 
         Returns:
             Steps, shape (S, n_free), and the bounds at which they end (see `Solution.at_bound`).

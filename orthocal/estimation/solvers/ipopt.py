@@ -22,6 +22,7 @@ from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
 from orthocal.estimation.solvers.program import (
+    CONVERGED,
     Program,
     Solution,
     SolverInput,
@@ -32,21 +33,19 @@ from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.runtime.interrupts import noticed_interrupt
 
 SMALLEST_WEIGHTING_SIGMA = 5e-6
-"""Smallest standard deviation by which readings are weighted, [m]. Below it readings and prior are
-scaled down together: the optimum is the same, and rounding errors remain below the tolerance."""
+"""Smallest standard deviation by which readings are weighted, [m]. For a smaller sigma the whole
+objective is multiplied by a factor. The optimum is the same, and rounding errors remain below the
+tolerance."""
 
 FULL_TOLERANCE_READINGS = 20_000
-"""Number of readings above which the tolerance grows, like the rounding errors of their sum."""
+"""Number of readings above which the tolerance grows like the rounding errors of their sum."""
 
 MAX_EXACT_HESSIAN_READINGS = 2_000
 """Largest number of readings for which the exact Hessian is tried if Gauss-Newton fails."""
 
 WIDTH_FACTORS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
-"""Widths of a robust loss as multiples of the requested one; each solution starts the next. They
-are used if outliers are so large that the requested width does not converge directly."""
-
-CONVERGED = "Solve_Succeeded"
-"""Status of Ipopt for a solution; any other status is an error."""
+"""Widths of a robust loss as multiples of the requested one. They are tried in this order if the
+requested width does not converge directly. Each solution is the start of the next."""
 
 COMPLEMENTARITY_TOLERANCE = 1e-11
 """Largest product of a bound's multiplier and the distance to the bound, both scaled. A parameter
@@ -65,9 +64,10 @@ class Expressions:
     """x: θ̂, gauge zeros, the passive coordinates of every state and the values of manually
     aligned nuisance parameters, scaled."""
     parameters: ca.MX
-    """p: readings, weights and noise ratios of the entries, then σ and scales of prior and loss."""
+    """p: readings, weights and noise ratios of the entries, then σ, the scale of the prior and the
+    width of the loss (see `parameter_values`)."""
     objective: ca.MX
-    """Σ ρ(r/σ) + ½ (θ − mean)ᵀ P⁻¹ (θ − mean), times (σ/5 µm)² if σ is below 5 µm."""
+    """Σ ρ(r/σ) + ½ Σ ((θ − mean)/prior std)², times (σ/5 µm)² if σ is below 5 µm."""
     constraints: ca.MX
     """Residuals of loop closures and of manual alignments, scaled; 0 at a solution."""
     errors: dict[str, ca.MX]
@@ -144,11 +144,11 @@ class NonlinearProgram(Program):
         program = self if exact else self._exact
         if not robust:
             return program._run(data)
-        step = data
+        present = data
         try:
             for width_factor in WIDTH_FACTORS:  # nearly squares first, then the requested width
-                solution = program._run(step, width_factor)
-                step = replace(step, start=solution.theta, start_passive=solution.passive)
+                solution = program._run(present, width_factor)
+                present = replace(present, start=solution.theta, start_passive=solution.passive)
         except SolverError:
             if exact:
                 raise
@@ -320,13 +320,13 @@ class NonlinearProgram(Program):
         return self._pack(sigma, y, self._weights(excluded), width_factor)
 
     def _pack(self, sigma: float, values: Array, weights: Array, width_factor: float) -> Array:
-        """Values of p, shape (3 n_entries + 3,)."""
+        """Values of the parameters p, shape (3 n_entries + 3,)."""
         weighted, scale = _weighting(sigma)
         width = self.options.loss.width * width_factor * sigma / weighted
         return np.concatenate([values, weights, self.problem.noise_ratio, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
-        """Functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
+        """Functions of x and p (the Hessian also of lam_f and lam_g), to check derivatives."""
         return dict(self._functions)
 
     @cached_property
@@ -352,7 +352,7 @@ class NonlinearProgram(Program):
             "nlp_scaling_method": "none",  # variables and functions are of order one
             "linear_solver": "mumps",
             "mumps_pivot_order": 6,  # QAMD, for a few dense rows: those of the parameters
-            # two thirds of the iterations of the monotone strategy if there are bounds
+            # needs two thirds of the iterations of the monotone strategy if there are bounds
             "mu_strategy": "adaptive",
             "mu_max": LARGEST_BARRIER,
             **_plain(self.options.ipopt),
@@ -414,7 +414,7 @@ def _require_accepted(options: Mapping[str, OptionValue]) -> None:
 
 
 def _weighting(sigma: float) -> tuple[float, float]:
-    """Standard deviation by which readings are weighted, and the scale of the objective."""
+    """Standard deviation by which readings are weighted, [m], and factor on the objective."""
     weighted = max(sigma, SMALLEST_WEIGHTING_SIGMA)
     return weighted, (sigma / weighted) ** 2
 

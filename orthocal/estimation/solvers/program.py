@@ -16,6 +16,9 @@ from orthocal.arrays import Array
 from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 
+CONVERGED = "Solve_Succeeded"
+"""Status of a solution, in the terms of Ipopt; any other status is an error."""
+
 EXCLUDED_WEIGHT = 1e-9
 """Weight of excluded readings: negligible, but it determines their gauge zeros."""
 
@@ -33,13 +36,14 @@ class Solution:
     objective: float
     """Objective: Σ ρ((y − h − z)/σ) plus the contribution of the prior."""
     status: str
-    """Status in the terms of Ipopt."""
+    """Status in the terms of Ipopt (see `CONVERGED`)."""
     iterations: int
     """Number of iterations."""
     hessian: Hessian
     """Hessian of the solver; always Gauss-Newton for solvers other than Ipopt."""
     closure: float
-    """Largest remaining closure residual, rotations times characteristic length, [m]."""
+    """Largest remaining closure residual of Ipopt, rotations times characteristic length, [m]; 0
+    for other solvers, which close the loops."""
     at_bound: NDArray[np.int8]
     """-1 for a parameter at its lower bound, 1 at its upper bound, else 0, shape (n_free,)."""
 
@@ -61,7 +65,7 @@ class SolverInput:
     prescribed: Mapping[int, float]
     """Indices of free parameters, mapped to prescribed values, [SI]."""
     mirrored: bool = True
-    """Start from mirror images of the solution, too."""
+    """True to start from mirror images of the solution, too."""
 
 
 class Program(ABC):

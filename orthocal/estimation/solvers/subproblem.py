@@ -14,11 +14,11 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.program import Solution, SolverInput, scaled_bounds
+from orthocal.estimation.solvers.program import CONVERGED, Solution, SolverInput, scaled_bounds
 from orthocal.observation.model import ReadingLinearisation
 
 SUBPROBLEM_TOLERANCE = 1e-11
-"""Last step of a subproblem with a robust loss, [prior std]."""
+"""Step of a subproblem with a robust loss below which it has converged, [prior std]."""
 
 MAX_SUBPROBLEM_STEPS = 100
 """Largest number of steps of a subproblem with a robust loss."""
@@ -31,7 +31,7 @@ MAX_PRIOR_DEVIATION = 8.0
 [prior std]: it is a local minimum, or readings are wrong."""
 
 MAX_NUMPY_SIZE = 50
-"""Largest system that NumPy solves in less time than the import of SciPy takes."""
+"""Largest number of unknowns for which NumPy takes less time than the import of SciPy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,8 +41,8 @@ class Iterate:
     theta: Array
     """θ̂, shape (n_free,)."""
     passive: Array
-    """Passive coordinates, (n_states, n_passive), [m, rad]; those of the linearisation if the
-    problem was linearised."""
+    """Passive coordinates, shape (n_states, n_passive), [m, rad]; of the linearised problem, those
+    at the point of linearisation."""
     deviation: Array
     """Readings minus predictions without gauge zeros, shape (n_entries,), [σ]."""
     zeros: Array
@@ -60,6 +60,9 @@ class Task:
         data: Readings, weights, start and prescribed values.
 
     Attributes:
+        problem: The problem.
+        loss: The loss function.
+        data: The input of the solver.
         sigma: Standard deviation of one reading, [m].
         weights: Weights of the entries, shape (n_entries,).
         low: Lower bounds of θ̂, shape (n_free,).
@@ -100,7 +103,7 @@ class Task:
             zeros=state.zeros * self.sigma,
             passive=passive,
             objective=state.objective,
-            status="Solve_Succeeded",
+            status=CONVERGED,
             iterations=iterations,
             hessian="gauss-newton",
             closure=0.0,
@@ -128,6 +131,7 @@ class Task:
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
+            LinAlgError: If a posture is singular.
             SolverError: If a sensor has no reading.
         """
         problem, passive = self.problem, self.data.start_passive
@@ -246,12 +250,15 @@ def are_far(problem: CalibrationProblem, theta: Array) -> Mask:
 def bounded_step(square: Array, gradient: Array, low: Array, high: Array) -> Array:
     """Step s that minimises ½ sᵀ A s − bᵀ s within bounds, shape (n_free,).
 
+    If A is singular, it is the shortest step without bounds, clipped to the bounds.
+
     Args:
         square: A, positive semidefinite, shape (n_free, n_free).
         gradient: b, shape (n_free,).
         low: Lower bounds of s, shape (n_free,).
         high: Upper bounds of s, shape (n_free,).
     """
+    # columns of unit norm; a parameter that changes nothing has a zero on the diagonal
     scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
     scaled, target = square * np.outer(scale, scale), gradient * scale
     limited = np.isfinite(low) | np.isfinite(high)
@@ -260,7 +267,7 @@ def bounded_step(square: Array, gradient: Array, low: Array, high: Array) -> Arr
         scaled, target, scale = scaled[np.ix_(order, order)], target[order], scale[order]
     try:
         factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
-    except np.linalg.LinAlgError:  # undetermined parameters: shortest step
+    except np.linalg.LinAlgError:  # undetermined parameters
         values, vectors = np.linalg.eigh(scaled)
         large = values > RANK_TOLERANCE * values.max(initial=0.0)
         step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
@@ -285,8 +292,8 @@ def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False)
 def _bounded(factor: Array, target: Array, low: Array, high: Array, *, n_limited: int) -> Array:
     """Vector s that minimises ‖R s − t‖ within bounds, for an upper triangular R, shape (n,).
 
-    Only the last n_limited components have bounds. They minimise the last rows, in which no other
-    component appears. The other components then solve the first rows exactly.
+    Only the last n_limited components have bounds. They minimise the residuals of the last rows, in
+    which no other component appears. The other components then solve the first rows exactly.
     """
     unbounded = _solve_triangular(factor, target)
     if ((unbounded >= low) & (unbounded <= high)).all():

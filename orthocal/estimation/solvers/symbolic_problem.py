@@ -2,7 +2,9 @@
 
 The variables are scaled to order one:
 
-    θ̂ = θ/(prior std),  q̂ = q · (1 or characteristic length)/1 mm,  ĝ = g · (1 or length)/1 mm
+    θ̂ = θ/(prior std),  q̂ = q l/(1 mm),  ĝ = g l/(1 mm)
+
+l is 1 for lengths, and the characteristic length of the robot for angles.
 """
 
 from __future__ import annotations

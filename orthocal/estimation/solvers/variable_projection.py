@@ -32,8 +32,8 @@ from orthocal.estimation.solvers.subproblem import Iterate, Task, are_far
 from orthocal.observation.model import ReadingLinearisation
 
 STEP_TOLERANCE = 1e-8
-"""Estimated next step at which the solver has converged, extrapolated from the ratio of the last
-steps, [prior std]."""
+"""Next step below which the solver has converged, [prior std]. It is extrapolated from the ratio of
+the last steps."""
 
 MAX_CORRECTION = 1e-3
 """Largest correction of a passive coordinate that readings follow to first order: an angle, [rad],
@@ -41,19 +41,19 @@ or the ratio of a length to the characteristic length of the robot. Its square c
 less than a micrometre."""
 
 RELAXATIONS = (16.0, 4.0, 1.0)
-"""Factors on the standard deviation of the readings; each solution starts the next."""
+"""Factors on the standard deviation of the readings; each solution is the start of the next."""
 
 MAX_HALVINGS = 12
 """Largest number of halvings of a step."""
 
 MEMORY = 4
-"""Number of earlier steps that accelerate a step."""
+"""Number of earlier steps from which the acceleration of a step is computed."""
 
 MAX_MIRRORED_ITERATIONS = 30
-"""Largest number of iterations from a mirror image; those that need more rarely converge."""
+"""Largest number of iterations from a mirror image. Descents that need more rarely converge."""
 
 SAME_OBJECTIVE = 1e-9
-"""Relative difference of the objectives of one optimum from two starts."""
+"""Relative difference of objectives below which two starts have the same optimum."""
 
 OBJECTIVE_TOLERANCE = 1e-12
 """Relative growth of the objective that counts as a rounding error."""
@@ -75,13 +75,13 @@ class VariableProjection(Program):
         if not (data.mirrored and len(directions)):
             return best
         iterations, passive = best.iterations, best.passive
-        most = min(MAX_MIRRORED_ITERATIONS, self.options.max_iterations)
+        limit = min(MAX_MIRRORED_ITERATIONS, self.options.max_iterations)
         starts = self.problem.mirrored_starts(best.theta[None], passive[None], directions)
         for start in starts[:, 0]:
             image = replace(data, start=start, start_passive=passive)
             task = Task(self.problem, self.options.loss, image)
             try:
-                state, jacobian, count = self._descend(task, task.begin(), most, open_loops=True)
+                state, jacobian, count = self._descend(task, task.begin(), limit, open_loops=True)
             except (ClosureError, SolverError):
                 continue
             iterations += count
@@ -90,7 +90,7 @@ class VariableProjection(Program):
         return replace(best, iterations=iterations)
 
     def _solve_from_start(self, data: SolverInput) -> Solution:
-        """Solve directly, and with increasing weights if that fails or ends far from the prior."""
+        """Solve directly, then with increasing weights if this fails or ends far from the prior."""
         try:
             direct = self._run(data)
         except (ClosureError, SolverError):
@@ -130,18 +130,19 @@ class VariableProjection(Program):
             ClosureError: If the solution cannot reach a posture.
         """
         task = Task(self.problem, self.options.loss, data)
-        most = self.options.max_iterations
+        limit = self.options.max_iterations
         start = task.begin()
         try:
-            state, jacobian, iterations = self._descend(task, start, most, open_loops=True)
+            state, jacobian, iterations = self._descend(task, start, limit, open_loops=True)
         except (ClosureError, SolverError):
-            state, jacobian, iterations = self._descend(task, task.begin(), most, open_loops=False)
+            # the start anew: the first descent has overwritten its Jacobian
+            state, jacobian, iterations = self._descend(task, task.begin(), limit, open_loops=False)
         return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 
     def _descend(
         self,
         task: Task,
-        begin: tuple[Iterate, ReadingLinearisation],
+        start: tuple[Iterate, ReadingLinearisation],
         max_iterations: int,
         *,
         open_loops: bool,
@@ -150,7 +151,7 @@ class VariableProjection(Program):
 
         Args:
             task: The task.
-            begin: The start, with closed loops.
+            start: Problem and linearisation at the start values, with closed loops.
             max_iterations: Largest number of iterations.
             open_loops: Accept steps after which the loops are closed to first order only.
 
@@ -159,7 +160,7 @@ class VariableProjection(Program):
             ClosureError: If the solution cannot reach a posture.
         """
         sizes, acceleration = np.full(3, np.inf), _Acceleration()
-        state, linear = begin
+        state, linear = start
         for iterations in range(1, max_iterations + 1):
             jacobian = linear.jacobian
             jacobian /= task.sigma  # in place: it may be large, and is not used again
@@ -194,7 +195,10 @@ class VariableProjection(Program):
     def _move_open(
         self, task: Task, state: Iterate, linear: ReadingLinearisation, step: Array
     ) -> tuple[Iterate, ReadingLinearisation] | None:
-        """State after a full step with open loops; None if they open too far or it is worse."""
+        """State after a full step, with loops closed to first order only.
+
+        None if the loops open too far, the objective increases or a posture is singular.
+        """
         theta = np.clip(state.theta + step, task.low, task.high)
         passive = state.passive + linear.follow(theta - state.theta)
         try:
@@ -215,10 +219,10 @@ class VariableProjection(Program):
     ) -> Iterate | None:
         """State with closed loops after a step that is halved until the objective decreases.
 
-        None if even a negligible part of the step is worse: only rounding errors remain.
+        None if even a negligible part of the step increases the objective: rounding errors remain.
 
         Raises:
-            SolverError: If no part of the step decreases it.
+            SolverError: If no part of the step decreases the objective.
             ClosureError: If the machine cannot reach a posture after any part of the step.
         """
         unreachable, reached = None, False
@@ -251,10 +255,10 @@ def have_converged(sizes: Array) -> Mask:
         sizes: Sizes of the last three steps, the last one first, infinite for none, shape (3, ...).
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        last = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
-        before = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
+        ratio = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
+        earlier = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
         return np.asarray(
-            (sizes[0] <= STEP_TOLERANCE) | (sizes[0] * np.maximum(last, before) <= STEP_TOLERANCE)
+            (sizes[0] <= STEP_TOLERANCE) | (sizes[0] * np.maximum(ratio, earlier) <= STEP_TOLERANCE)
         )
 
 
@@ -281,9 +285,10 @@ class _Acceleration:
         self._steps = [*self._steps[-MEMORY:], step]
         if len(self._steps) == 1:
             return step
-        of_steps, of_points = (np.diff(np.array(a), axis=0).T for a in (self._steps, self._points))
-        shares = np.linalg.lstsq(of_steps, step, rcond=None)[0]
-        return np.asarray(step - (of_steps + of_points) @ shares)
+        differences = (np.diff(np.array(a), axis=0).T for a in (self._steps, self._points))
+        step_changes, point_changes = differences
+        shares = np.linalg.lstsq(step_changes, step, rcond=None)[0]
+        return np.asarray(step - (step_changes + point_changes) @ shares)
 
 
 def _is_not_worse(trial: Iterate, state: Iterate) -> bool:
