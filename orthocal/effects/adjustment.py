@@ -1,10 +1,11 @@
 """Mechanical adjustments: feet and shims under a slide, and threads that lengthen a rod.
 
-A foot moves one point of a slide's rail by a known amount along a direction d. The rail turns about
-a second point, the pivot. Without a pivot it is translated:
+A foot moves one point of a slide's rail, `at`, by a known amount along the unit vector d. The rail
+turns about a second point, the pivot. Without a pivot it is translated. With r the component of
+at − pivot normal to d, the rotation ω and the translation v at the world origin are
 
-    twist per metre   ω = (r × d)/|r|²,  v = −ω × pivot,  r = at − pivot, component normal to d
-                      ω = 0,             v = d            without a pivot
+    per metre   ω = (r × d)/|r|²,  v = −ω × pivot
+                ω = 0,             v = d             without a pivot
 
 A thread lengthens one rod. The amount of an adjustment is a sum of elementary errors of the
 geometry, `<name>.adjustment`, and 0 for the present machine. Sessions before and after an
@@ -45,7 +46,7 @@ SHORTEST_LEVER = 1e-3
 """Shortest accepted lever arm of a foot about its pivot, normal to its direction, [m]."""
 
 LEVER_SHARE = 0.05
-"""Relative standard deviation of an amount: lever arms have a tolerance of 10 %."""
+"""Relative standard deviation of an amount, which is that of its lever arm (tolerance 10 %)."""
 
 NEGLIGIBLE = 1e-12
 """Components of a twist per metre below this are rounding errors, [1, rad/m]."""
@@ -57,6 +58,7 @@ SAME_AMOUNT = 1e-9
 """Largest difference between equal amounts, [m]."""
 
 Vector = tuple[Number, Number, Number]
+"""Coordinates x, y and z in the world frame, in the unit of the key."""
 
 
 class AdjustmentKeys(EffectKeys):
@@ -156,13 +158,13 @@ def require_adjustment(robot: Robot, name: str, *, where: str, error: type[Ortho
 
 
 def add_amounts(before: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
-    """Sums of amounts by the name of the adjustment, [m]."""
+    """Sums of two sets of amounts, by the name of the adjustment, [m]."""
     names = dict.fromkeys([*before, *more])
     return {name: before.get(name, 0.0) + more.get(name, 0.0) for name in names}
 
 
 def subtract_amounts(after: Mapping[str, float], before: Mapping[str, float]) -> dict[str, float]:
-    """Differences of amounts by the name of the adjustment, [m], without unchanged ones."""
+    """Amounts after minus before, by the name of the adjustment, [m]; equal ones are omitted."""
     changes = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in {**before, **after}}
     return {name: change for name, change in changes.items() if abs(change) > SAME_AMOUNT}
 
@@ -199,10 +201,10 @@ def adjustment_parameters(
 def _on_frames(
     robot: Robot, placement: Placement, twist: Array, frames: set[int]
 ) -> list[tuple[Placement, Array]]:
-    """Split the twist of a placement without errors among those with errors that it carries.
+    """Express the twist of a frame without errors by twists of the frames with errors on it.
 
-    These are the next frames with errors on the kinematic chain. Other twists are returned
-    unchanged.
+    These are the nearest such frames that the displaced frame carries. The twist of another
+    placement is returned unchanged.
 
     Args:
         robot: The robot.
@@ -270,7 +272,13 @@ class AdjustmentChanges(Effect):
         """Build the effect for a robot with adjustments."""
         adjustments = find_adjustments(robot)
         errors = (
-            ElementaryError(f"{a.name}{SETTING}", cls.name, a.name, "m", a.rounding_std)
+            ElementaryError(
+                name=f"{a.name}{SETTING}",
+                kind=cls.name,
+                owner=a.name,
+                unit="m",
+                prior_std=a.rounding_std,
+            )
             for a in adjustments
         )
         return cls(adjustments, tuple(errors))
@@ -285,6 +293,7 @@ class AdjustmentChanges(Effect):
         for i, (adjustment, error) in enumerate(zip(self.adjustments, self.errors, strict=True)):
             change = changes[i]
             relative = LEVER_SHARE / adjustment.rounding_std * change
+            # the square of the sign is 1, or 0 without a change, which has no setting error
             amount = change + ca.sqrt(ca.sign(change) ** 2 + relative**2) * errors[error.name]
             for placement, unit_twist in adjustment.twists.items():
                 twist = ca.sparsify(ca.SX(unit_twist)) * amount
@@ -293,7 +302,11 @@ class AdjustmentChanges(Effect):
 
 
 def _rod_twists(keys: AdjustmentKeys, robot: Robot) -> dict[Placement, Array]:
-    """Twists of the placements on the rod that a thread lengthens."""
+    """Twists per metre of the placements on the rod that a thread lengthens.
+
+    Raises:
+        RobotError: If the rod does not exist, or keys of a foot are stated, too.
+    """
     for key in ("moves", "at_mm", "direction", "pivot_mm"):
         if getattr(keys, key) is not None:
             raise RobotError("found with 'lengthens', which excludes it", where=key)
@@ -309,7 +322,11 @@ def _rod_twists(keys: AdjustmentKeys, robot: Robot) -> dict[Placement, Array]:
 
 
 def _foot_twists(keys: AdjustmentKeys, robot: Robot) -> dict[Placement, Array]:
-    """Placement of the slide that a foot moves, with its twist per metre in the joint's axes."""
+    """Placement of the slide that a foot moves, with its twist per metre in the joint's axes.
+
+    Raises:
+        RobotError: If a key is missing or does not fit; names the key.
+    """
     drives = [d.name for d in robot.drives]
     if keys.moves not in drives:
         problem = "is missing" if keys.moves is None else f"found '{keys.moves}'"

@@ -49,7 +49,12 @@ class Backlash(Effect):
         }
         errors = (
             ElementaryError(
-                f"{d.name}.backlash", cls.name, d.name, d.unit, stds[d.unit], positive=True
+                name=f"{d.name}.backlash",
+                kind=cls.name,
+                owner=d.name,
+                unit=d.unit,
+                prior_std=stds[d.unit],
+                positive=True,
             )
             for d in robot.drives
         )

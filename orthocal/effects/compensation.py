@@ -29,8 +29,8 @@ class JointTrim(FileRecord):
     backlash: Annotated[Number, Field(ge=0.0)] = 0.0
     """Compensated backlash, [m, rad]; a table replaces it."""
     table: Matrix | None = None
-    """Position of the joint, trim after the position grew, trim after it fell; shape (n, 3),
-    [m, rad]."""
+    """Ascending positions of the joint, trims after the position grew, and trims after it fell;
+    shape (n, 3), [m, rad]."""
     home: Number | None = None
     """Position of the joint at its home switch (HOME_OFFSET), [m, rad]; None if not stated."""
 
@@ -63,14 +63,14 @@ Compensation = tuple[JointTrim, ...]
 """Trim of the joint of each drive, in the robot's order; empty if not stated."""
 
 SAME_TRIM = 1e-8
-"""Largest difference between equal trims, [m, rad]: they are written to 1e-6 mm or 1e-6 deg, which
-rounds angles by 0.9e-8 rad."""
+"""Largest difference between equal trims, [m, rad]. Files state them to 1e-6 mm or 1e-6 deg, which
+rounds angles by up to 0.9e-8 rad."""
 
 
 def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> bool:
-    """True if two controllers have the same compensation; an empty one is none."""
-    none = (JointTrim(),) * len(one or other)
-    for a, b in zip(one or none, other or none, strict=True):
+    """True if two controllers have the same compensation; an empty sequence is no compensation."""
+    no_trims = (JointTrim(),) * len(one or other)
+    for a, b in zip(one or no_trims, other or no_trims, strict=True):
         positions = [t.table[:, 0] for t in (a, b) if t.table is not None]
         joints = np.concatenate([*positions, np.zeros(1)])
         if np.abs(a(joints) - b(joints)).max() > SAME_TRIM:
@@ -115,18 +115,18 @@ def displace_drives(
     is_periodic = any(e.period is not None for e in effects)
     result = np.zeros(displayed.shape)
     for i, (drive, trim) in enumerate(zip(robot.drives, trims, strict=True)):
-        both = trim(drive.to_joint(displayed[:, i]))
-        half = 0.5 * (both[:, 0] - both[:, 1])
-        result[:, i] = has_backlash * sides[:, i] * half
+        values = trim(drive.to_joint(displayed[:, i]))
+        if has_backlash:
+            result[:, i] += sides[:, i] * 0.5 * (values[:, 0] - values[:, 1])
         if is_periodic:
-            result[:, i] += drive.direction * both.mean(axis=1)
+            result[:, i] += drive.direction * values.mean(axis=1)
     return result
 
 
 def describe_trims(robot: Robot, trims: Sequence[JointTrim]) -> str:
     """Description of the compensation of each drive; "" if there is none."""
     texts = []
-    for drive, trim in zip(robot.drives, trims, strict=False):
+    for drive, trim in zip(robot.drives, trims, strict=False):  # there may be no trims
         if trim.table is not None:
             texts.append(f"{drive.name} by a table")
         elif trim.backlash:
@@ -140,7 +140,7 @@ def table_name(joint: int) -> str:
 
 
 def format_table(trim: JointTrim, drive: Drive) -> str:
-    """Text of a table in mm or degrees: position, trim after it grew, trim after it fell."""
+    """Text of a trim's table in mm or degrees, in the columns of `JointTrim.table`; "" without."""
     if trim.table is None:
         return ""
     rows = trim.table / drive.joint_size

@@ -35,13 +35,14 @@ class Drift(Effect):
     conditions = ("time",)
 
     setup_errors: tuple[ElementaryError, ...]
-    """Rate of each setup, `drift`, [m/s]."""
+    """Rate of the drift in each setup, `drift`, [m/s]."""
 
     @classmethod
     def from_keys(cls, keys: DriftKeys, robot: Robot) -> Self:
         """Build the effect for a robot (see `Effect.from_keys`)."""
         std = read_limit(keys.tolerance_um_per_min) * UM / 60.0
-        return cls((ElementaryError("drift", cls.name, "", "m/s", std),))
+        rate = ElementaryError(name="drift", kind=cls.name, owner="", unit="m/s", prior_std=std)
+        return cls((rate,))
 
     def describe(self) -> str:
         """Description in a few words."""
@@ -52,9 +53,6 @@ class Drift(Effect):
         return reading + errors["drift"] * conditions["time"]
 
     def negligible_difference(self, condition: Condition, change: float) -> float:
-        """Difference of time (see `Effect.negligible_difference`), [s].
-
-        The rate is at its tolerance.
-        """
+        """Difference of time at the largest rate (see `Effect.negligible_difference`), [s]."""
         (rate,) = self.setup_errors
         return change / show_limit(rate.prior_std)

@@ -37,19 +37,28 @@ class DriveErrors(Effect):
 
     robot: Robot
     errors: tuple[ElementaryError, ...]
-    """Offsets of all drives, `<drive>.offset`, then scale errors, `<drive>.scale`."""
+    """Offsets `<drive>.offset` of all drives, [m, rad], then scale errors `<drive>.scale`, [1]."""
 
     @classmethod
     def from_keys(cls, keys: DriveTolerances, robot: Robot) -> Self:
         """Build the effect for a robot (see `Effect.from_keys`)."""
         stds = {"m": read_limit(keys.offset_mm) * MM, "rad": read_limit(keys.offset_mrad) * MRAD}
         offsets = (
-            ElementaryError(f"{d.name}.offset", "offset", d.name, d.unit, stds[d.unit])
+            ElementaryError(
+                name=f"{d.name}.offset",
+                kind="offset",
+                owner=d.name,
+                unit=d.unit,
+                prior_std=stds[d.unit],
+            )
             for d in robot.drives
         )
-        scale = read_limit(keys.scale_ppm) * PPM
+        scale_std = read_limit(keys.scale_ppm) * PPM
         scales = (
-            ElementaryError(f"{d.name}.scale", "scale", d.name, "1", scale) for d in robot.drives
+            ElementaryError(
+                name=f"{d.name}.scale", kind="scale", owner=d.name, unit="1", prior_std=scale_std
+            )
+            for d in robot.drives
         )
         return cls(robot, (*offsets, *scales))
 

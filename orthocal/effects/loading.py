@@ -100,7 +100,11 @@ def _choose_effects(robot: Robot, chosen: tuple[str, ...] | None) -> Robot:
 
 
 def with_adjustments(robot: Robot) -> Robot:
-    """Robot whose placements depend on the mechanical adjustments of each session."""
+    """Robot whose placements depend on the mechanical adjustments of each session.
+
+    Raises:
+        RobotError: If an adjustment in its YAML does not fit the robot.
+    """
     return robot if robot.adjusted else _with_parameters(replace(robot, adjusted=True))
 
 
@@ -190,7 +194,7 @@ def identified_effects(robot: Robot) -> tuple[Effect, ...]:
 
 
 def neutral_values(robot: Robot) -> dict[Condition, float]:
-    """Values of conditions that are not stated, under which the effects change nothing."""
+    """Values for conditions that are not stated; under them the effects change nothing."""
     values = dict(NEUTRAL)
     for effect in robot_effects(robot):
         values.update(effect.neutral)

@@ -37,19 +37,20 @@ def express_machine(
         robot: The nominal robot.
         commanded: Commanded drive coordinates, shape (n_drives,), [m, rad].
         errors: All elementary errors by name, [SI].
-        conditions: All conditions of the posture.
+        conditions: All conditions of the posture by name, in the units of `Condition`.
 
     Returns:
         Actual drive coordinates, shape (n_drives,), [m, rad]; and the placements on which effects
         act, mapped to their twist δ, shape (6,), [m, rad].
     """
-    actuated, twists = commanded, dict[Placement, ca.SX]()
+    actuated = commanded
+    twists: dict[Placement, ca.SX] = {}
     for effect in reversed(robot_effects(robot)):  # gain and offset of the drives act last
         parameters = {e.name: errors[e.name] for e in effect.errors}
         needed: Symbols = {name: conditions[name] for name in effect.conditions}
         source = type(effect).__qualname__
-        moved = effect.drives(actuated, parameters, needed)
-        actuated = require_expression(moved, len(robot.drives), f"{source}.drives")
+        changed = effect.drives(actuated, parameters, needed)
+        actuated = require_expression(changed, len(robot.drives), f"{source}.drives")
         displacements = [effect.placements(parameters, needed)]
         for rod, change in effect.rods(parameters, needed).items():
             change = require_expression(change, 1, f"{source}.rods")

@@ -55,7 +55,7 @@ stated are those of the command."""
 
 
 def condition_size(robot: Robot, name: Condition) -> int:
-    """Count of the numbers that state a condition."""
+    """Number of values of a condition, as in `Condition`."""
     sizes = {
         "approach": len(robot.drives),
         "load": len(robot.rods),
@@ -81,16 +81,16 @@ class Effect:
     """Key under `orthocal.effects`."""
     keys: ClassVar[type[EffectKeys]] = EffectKeys
     conditions: ClassVar[tuple[Condition, ...]] = ()
-    """Conditions of a reading on which its expressions depend."""
+    """Conditions of a reading on which the effect's expressions depend."""
 
     errors: tuple[ElementaryError, ...] = ()
     """Parameters of the machine with their priors, 0 for the nominal machine. Every model
     identifies them."""
     setup_errors: tuple[ElementaryError, ...] = ()
-    """Parameters of each setup, whose names are prefixed with that of the setup."""
+    """Parameters of each setup with their priors: `drift` of setup yx becomes `setup.yx.drift`."""
     period: float | None = None
-    """Travel of a drive after which its errors repeat, [m]. Readings at multiples of the period
-    cannot determine them."""
+    """Travel of a drive after which the effect repeats, [m]; None if it is not periodic. Readings
+    at multiples of the period cannot determine it."""
 
     @classmethod
     def from_keys(cls, keys: Any, robot: Robot) -> Self:  # noqa: ANN401 - an instance of `keys`
@@ -180,7 +180,7 @@ class Effect:
 
 
 def require_expression(value: object, rows: int, source: str) -> ca.SX:
-    """Check what a method of a sensor or an effect returns.
+    """Return value of a sensor's or effect's method, which must be a column of expressions.
 
     Args:
         value: The returned value.
@@ -188,7 +188,7 @@ def require_expression(value: object, rows: int, source: str) -> ca.SX:
         source: The method, for the message.
 
     Raises:
-        OrthocalError: If it is no column of expressions of this size.
+        OrthocalError: If the value is no CasADi expression, or has another shape.
     """
     if isinstance(value, ca.SX) and value.shape == (rows, 1):
         return value
@@ -199,6 +199,6 @@ def require_expression(value: object, rows: int, source: str) -> ca.SX:
 
 
 def add_twist(twists: dict[Placement, ca.SX], placement: Placement, twist: ca.SX) -> None:
-    """Add a twist of a placement, shape (6,), [m, rad], to those of all placements."""
+    """Add a twist, shape (6,), [m, rad], to that of a placement in a mapping of all twists."""
     present = twists.get(placement)
     twists[placement] = twist if present is None else present + twist

@@ -42,8 +42,8 @@ BUILT_IN = {
     "drift": "orthocal.effects.drift:Drift",
     "compliance": "orthocal.effects.compliance:Compliance",
 }
-"""Built-in effects and their classes, in the order of a machine; effects on drives act in the
-reverse order. Each class is imported on first use."""
+"""Built-in effects and their classes, which are imported on first use. A machine has its effects in
+this order; on the drives they act in the reverse order."""
 
 _EFFECTS = Registry[type[Effect]](GROUP, "effect", _require_effect, BUILT_IN)
 
@@ -52,7 +52,7 @@ def register_effect(effect: type[Effect]) -> None:
     """Register an effect; it replaces an effect of the same name.
 
     Raises:
-        TypeError: If it is no class of an effect.
+        TypeError: If it is no class derived from Effect with a name, or needs an unknown condition.
     """
     require_kind(effect, type, expected="a class that is derived from Effect")
     _EFFECTS.register(getattr(effect, "name", ""), effect)
@@ -75,5 +75,9 @@ def order_effects(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def find_effect(name: str, *, where: str, error: type[OrthocalError]) -> type[Effect]:
-    """Class of the effect of a name (see `Registry.find`)."""
+    """Class of the effect of a name (see `Registry.find`).
+
+    Raises:
+        OrthocalError: Of kind `error`, if there is no such effect or its package cannot be loaded.
+    """
     return _EFFECTS.find(name, where=where, error=error)

@@ -69,13 +69,13 @@ class RodForces:
         self._index = {placement: i for i, placement in enumerate(placements)}
 
     def __call__(self, coordinates: Array) -> Array:
-        """Axial forces ∂p/∂ℓ per unit force on the tool centre point, tension positive.
+        """Axial forces of the rods per unit force on the tool centre point, tension positive.
 
         Args:
             coordinates: Joint coordinates with closed loops, shape (K, nv), [m, rad].
 
         Returns:
-            Shape (K, n_rods, 3), for forces along x, y and z of the world. Rods are in the order of
+            ∂p/∂ℓ, shape (K, n_rods, 3), for forces along x, y and z of the world, in the order of
             `Robot.rods`.
         """
         data = self.robot.model.createData()
@@ -93,7 +93,12 @@ class RodForces:
         return result
 
     def _evaluate(self, coordinates: Array, data: pin.Data) -> tuple[Array, ...]:
-        """∂g/∂q, ∂p/∂q, and the world rotations of the axes of closures and of the placements."""
+        """Jacobians and rotations in one posture.
+
+        Returns:
+            ∂g/∂q, ∂p/∂q, and the world rotations of the axes of the closures and of the displaced
+            placements, shape (n, 3, 3) each.
+        """
         robot, model = self.robot, self.robot.model
         _, by_joints = robot.evaluate_constraints_at(coordinates, data=data)
         pin.updateFramePlacements(model, data)

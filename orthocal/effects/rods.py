@@ -12,7 +12,8 @@ from orthocal.robot.frames import Placement, carriers, parent_frame
 from orthocal.robot.model import Robot, Rod
 
 SAME_POSITION = 1e-6
-"""Largest distance between equal positions along a rod, as a fraction of its length."""
+"""Largest difference between equal positions along a rod, as a fraction of its length. Smaller
+components of a displacement per change of the length are rounding errors, too."""
 
 
 def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]:
@@ -33,6 +34,7 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
     axis = (tip - root) / rod.length
 
     def fraction(position: np.ndarray) -> float:
+        """Position along the rod: 0 at the root, 1 at the tip."""
         return float(axis @ (position - root)) / rod.length
 
     fractions = [fraction(data.oMi[i].translation) for i in range(model.njoints)]
@@ -40,6 +42,7 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
     twists: dict[Placement, ca.SX] = {}
 
     def move(placement: Placement, pose: pin.SE3, carrier: pin.SE3) -> None:
+        """Displace a placement relative to its carrier by its share of the change."""
         stretched = fraction(pose.translation) - fraction(carrier.translation)
         if abs(stretched) > SAME_POSITION:
             local = pose.rotation.T @ axis * stretched
@@ -50,12 +53,12 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
         if int(model.parents[joint]) == body:
             # pose before the motion of the joint, in which placements act
             pose = data.oMi[body] * model.jointPlacements[joint]
-            move(Placement(joint, False), pose, data.oMi[body])
+            move(Placement(joint, of_frame=False), pose, data.oMi[body])
     for frame in sorted(_used_frames(robot)):
         if int(model.frames[frame].parentJoint) == body:
             parent = parent_frame(model, frame)
             carrier = data.oMi[body] if parent is None else data.oMf[parent]
-            move(Placement(frame, True), data.oMf[frame], carrier)
+            move(Placement(frame, of_frame=True), data.oMf[frame], carrier)
     return twists
 
 
@@ -75,6 +78,6 @@ def _body_of(robot: Robot, rod: Rod, fractions: Sequence[float]) -> int:
 
 
 def _used_frames(robot: Robot) -> set[int]:
-    """Frames of closures, legs, rods and the tool, with the frames that carry them."""
+    """Indices of the frames of closures, legs, rods and tool, and of the frames that carry them."""
     names = {*robot.frames, *(f for rod in robot.rods.values() for f in (rod.root, rod.tip))}
     return {f for name in names for f in carriers(robot.model, robot.frame_id(name))}

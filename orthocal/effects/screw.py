@@ -63,9 +63,11 @@ class Screw(Effect):
                     where="lead_mm",
                 )
         errors = (
-            ElementaryError(f"{d.name}.{kind}", cls.name, d.name, "m", std)
+            ElementaryError(
+                name=f"{d.name}.{component}", kind=cls.name, owner=d.name, unit="m", prior_std=std
+            )
             for d in linear
-            for kind in SCREW_COMPONENTS
+            for component in SCREW_COMPONENTS
         )
         return cls(robot, keys.lead_mm * MM, tuple(errors))
 
@@ -81,8 +83,9 @@ class Screw(Effect):
     def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
         """Actual drive coordinates (see `Effect.drives`)."""
         phase = 2.0 * np.pi * coordinates / self.lead
+        zero = ca.SX(1, 1)  # for revolute drives, which have no screw
         sine, cosine = (
-            ca.vertcat(*(errors.get(f"{d.name}.{kind}", ca.SX(1, 1)) for d in self.robot.drives))
-            for kind in SCREW_COMPONENTS
+            ca.vertcat(*(errors.get(f"{d.name}.{component}", zero) for d in self.robot.drives))
+            for component in SCREW_COMPONENTS
         )
         return coordinates + sine * ca.sin(phase) + cosine * ca.cos(phase)

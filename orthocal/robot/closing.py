@@ -24,17 +24,27 @@ SMALLEST_SHOWN = 1e-9
 """Openings below this are omitted from messages, [m or rad]."""
 
 MAX_STEPS = 150
+"""Largest number of steps of a search."""
+
 LARGEST_STEP = 0.5
 """Largest change of a coordinate in one step, [m or rad]."""
 
 _MAX_TRIALS = 10
 """Trials of a step with increasing damping."""
+
 _FIRST_DAMPING = 1e-3
-"""Damping relative to the squared residual, with which it vanishes: convergence is quadratic."""
+"""First ratio of damping to squared residual. The damping vanishes with the residual, so that
+convergence is quadratic."""
+
+_MORE_DAMPING, _LESS_DAMPING = 4.0, 3.0
+"""Factor of this ratio after a failed trial, and its divisor after a step."""
+
 _WINDOW = 12
 """Steps after which a search with too little progress ends."""
+
 _MIN_REDUCTION = 0.1
 """Smallest relative reduction of the squared residual within _WINDOW steps."""
+
 RANK_TOLERANCE = 1e-10
 """Singular values of closures below this fraction of the largest one count as zero."""
 
@@ -73,10 +83,11 @@ def close_loops(
         start: Start values of the coordinates, shape (n,), [m, rad].
         row_units: Metres per unit of each row, the diagonal of W, shape (m,).
         units: Metres per unit of each coordinate, the diagonal of U, shape (n,).
-        bounds: Lower and upper bounds of the coordinates; steps are clipped to them.
+        bounds: Lower and upper bounds of the coordinates, shape (n,) or scalar, [m, rad]; steps are
+            clipped to them.
 
     Returns:
-        The last point, whether its loops are closed or not.
+        Coordinates and residual after the last step, even if the loops are still open.
     """
     lower, upper = (np.asarray(b, dtype=np.float64) for b in bounds)
     weights, scale = np.asarray(row_units), np.asarray(units)
@@ -94,6 +105,7 @@ def close_loops(
             break
         scaled = weights[:, None] * jacobian / scale
         descent = -(weights * residual) @ scaled
+        # coordinates at a bound, which the step would cross, stay there
         scaled[:, ((x <= lower) & (descent < 0.0)) | ((x >= upper) & (descent > 0.0))] = 0.0
         damped_step = _decompose(weights * residual, scaled)
         for _ in range(_MAX_TRIALS):
@@ -103,19 +115,19 @@ def close_loops(
             r, j = evaluate(trial)
             if float(np.square(weights * r).sum()) < cost:
                 break
-            damping *= 4.0
+            damping *= _MORE_DAMPING
         else:
             break
         x, residual, jacobian = trial, r, j
-        damping /= 3.0
+        damping /= _LESS_DAMPING
     return Closing(x, residual)
 
 
 def _decompose(residual: Array, jacobian: Array) -> Callable[[float], Array]:
     """Function of the damping that returns damped steps from one singular value decomposition."""
     u, values, vt = np.linalg.svd(jacobian, full_matrices=False)
-    rank = values > RANK_TOLERANCE * values.max(initial=0.0)
-    s, vt, projected = values[rank], vt[rank], (u.T @ residual)[rank]
+    nonzero = values > RANK_TOLERANCE * values.max(initial=0.0)
+    s, vt, projected = values[nonzero], vt[nonzero], (u.T @ residual)[nonzero]
 
     def damped_step(damping: float) -> Array:
         return np.asarray(-(vt.T @ (s / (s * s + damping) * projected)))
@@ -157,5 +169,5 @@ def describe_opening(residual: ArrayLike, rotations: ArrayLike) -> str:
 
 
 def _three_digits(value: float) -> str:
-    """Number with three significant digits, without exponent above 1000."""
+    """Number with three significant digits; from 1000 on an integer, without exponent."""
     return f"{value:.0f}" if value >= 1000.0 else f"{value:.3g}"

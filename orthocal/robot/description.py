@@ -18,7 +18,7 @@ from orthocal.text import composed
 Row = Literal["x", "y", "z", "rx", "ry", "rz"]
 Coordinate = Literal["x", "y", "z"]
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(composed)]
-
+"""Name of a part of the machine; a URDF permits any characters."""
 
 ClosureKind = Annotated[
     Literal["3d", "6d"],
@@ -112,8 +112,8 @@ class TcpKeys(Keys):
     """Commanded world coordinates; one per drive if postures are tool positions."""
 
 
-def _require_ascending(limits: list[float]) -> list[float]:
-    """Require limits of a workspace in ascending order and within LARGEST_WORKSPACE_MM."""
+def _require_workspace_limits(limits: list[float]) -> list[float]:
+    """Require the lower limit of a workspace first, and both within LARGEST_WORKSPACE_MM."""
     low, high = limits
     if not -LARGEST_WORKSPACE_MM <= low < high <= LARGEST_WORKSPACE_MM:
         raise ValueError(
@@ -126,7 +126,9 @@ def _require_ascending(limits: list[float]) -> list[float]:
 WorkspaceBox = Annotated[
     list[
         Annotated[
-            list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_ascending)
+            list[Number],
+            Field(min_length=2, max_length=2),
+            AfterValidator(_require_workspace_limits),
         ]
     ],
     Field(min_length=1, max_length=3),
@@ -149,15 +151,15 @@ class BedKeys(Keys):
     program moves the tool below it."""
 
 
-def _require_rising(limits: list[float]) -> list[float]:
-    """Require that the first of two numbers is not the larger one."""
+def _require_order(limits: list[float]) -> list[float]:
+    """Require that the first of two numbers is not above the second."""
     low, high = limits
     if low > high:
         raise ValueError(f"found [{low:g}, {high:g}]; expected [lowest, highest]")
     return limits
 
 
-_Range = Annotated[list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_rising)]
+_Range = Annotated[list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_order)]
 
 
 class UseKeys(Keys):
@@ -173,7 +175,7 @@ class UseKeys(Keys):
 
     @model_validator(mode="after")
     def _require_within_limits(self) -> UseKeys:
-        """Refuse temperatures and masses that are out of range, as "KEY|PROBLEM"."""
+        """Refuse temperatures and masses out of range; the message is "KEY|PROBLEM"."""
         ranges = {
             "temperature_C": (self.temperature_C, LOWEST_C, HIGHEST_C, "degrees Celsius"),
             "payload_kg": (self.payload_kg, 0.0, HEAVIEST_KG, "kilograms"),

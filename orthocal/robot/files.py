@@ -22,7 +22,7 @@ LARGEST_MESHES = 8 * 2**20
 """Largest total size of the meshes that are stored with a robot, [bytes]."""
 
 LONGEST_NAME = 255
-"""Length of the longest path of a stored file, [bytes]."""
+"""Largest length of the path of a stored file, [bytes]."""
 
 MOST_FILES = 1_000
 """Largest number of files of a stored robot."""

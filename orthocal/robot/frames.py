@@ -76,7 +76,7 @@ def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[int, Arra
         nominal: The model without errors.
         twists: Indices of frames, mapped to their errors δ, shape (6,), [m, rad].
     """
-    moved: dict[int, pin.SE3] = {}
+    moved: dict[int, pin.SE3] = {}  # parents precede their children in a model
     for i, frame in enumerate(nominal.frames):
         carrier, placement = parent_frame(nominal, i), frame.placement
         if carrier is not None and carrier in moved:

@@ -8,13 +8,13 @@ at a quarter turn about y, far beyond the range of a ball joint.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from typing import Any
 
 from lxml import etree
 
 from orthocal.errors import RobotError
+from orthocal.robot.parameters import suggest
 
 Element = Any
 """Element of lxml, which has no types."""
@@ -53,10 +53,9 @@ def retype_joints(root: Element, types: Mapping[str, str], *, where: str) -> lis
     added: list[str] = []
     for name, declared in types.items():
         if name not in moving:
-            close = difflib.get_close_matches(name, moving, n=1, cutoff=0.5)
-            hint = f"; did you mean {close[0]}?" if close else ""
             raise RobotError(
-                f"the URDF has no moving joint '{name}'{hint}", where=f"{where}: joint_name"
+                f"the URDF has no moving joint '{name}'{suggest(name, moving)}",
+                where=f"{where}: joint_name",
             )
         if declared == FIXED:
             joints[name].set("type", "fixed")
@@ -66,7 +65,14 @@ def retype_joints(root: Element, types: Mapping[str, str], *, where: str) -> lis
 
 
 def _split(root: Element, joint: Element, axes: str, *, where: str) -> list[str]:
-    """Replace a joint by revolute joints in series, one per axis; returns their names."""
+    """Replace a joint by revolute joints in series, one per axis.
+
+    Returns:
+        Names of the new joints.
+
+    Raises:
+        RobotError: If the URDF already has one of these names.
+    """
     name = joint.get("name")
     new_names = [f"{name}_{axis}" for axis in axes]
     existing = {e.get("name") for tag in ("link", "joint") for e in root.findall(tag)}
@@ -85,6 +91,7 @@ def _split(root: Element, joint: Element, axes: str, *, where: str) -> list[str]
         etree.SubElement(part, "parent", link=parent)
         etree.SubElement(part, "child", link=child)
         etree.SubElement(part, "axis", xyz=_AXES[axis])
+        # placeholders that URDF requires; `load_urdf` removes the limits
         etree.SubElement(part, "limit", effort="1", velocity="1", lower="0", upper="0")
         if child != links[-1]:
             etree.SubElement(root, "link", name=child)

@@ -56,6 +56,7 @@ MAX_LOADED = 8
 def packaged_robots() -> dict[str, Path]:
     """Directories of the built-in robots by name."""
     package = Path(str(resources.files("orthocal")))
+    # an installed package contains the robots; a source tree has them beside the package
     for folder in (package / "_robots", package.parent / "robots"):
         if folder.is_dir():
             return {f.name: f for f in sorted(folder.iterdir()) if any(f.glob("*.urdf"))}
@@ -144,7 +145,7 @@ def _load_folder(folder: Path) -> Robot:
 
 
 def _read_folder(folder: Path) -> tuple[Path, Path, tuple[bytes, bytes]]:
-    """URDF and YAML of a robot directory, and their contents."""
+    """Paths of the URDF and the YAML of a robot directory, and their contents in this order."""
     yaml_path, urdf_path = find_robot_files(folder)
     urdf, yaml = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
     return urdf_path, yaml_path, (urdf, yaml)
@@ -204,18 +205,18 @@ def _build_robot(
 def find_robot_files(folder: Path) -> tuple[Path, Path]:
     """YAML and URDF of a robot directory.
 
-    They have the name of the directory. If the directory was renamed, its only URDF counts, and the
-    YAML of the same name.
+    They have the name of the directory. In a renamed directory they are its only URDF, and the YAML
+    of the same name as this URDF.
 
     Raises:
-        RobotError: If it is not clear which files are meant.
+        RobotError: If there is no URDF or no YAML, or if several have other names.
     """
     urdf = _find_file(folder, ".urdf", folder.resolve().name)
     return _find_file(folder, ".yaml", folder.resolve().name, urdf.stem), urdf
 
 
 def _find_file(folder: Path, suffix: str, *names: str) -> Path:
-    """File with the first existing one of some names, otherwise the only file with the suffix."""
+    """File with the first of some names that exists, otherwise the only file with the suffix."""
     preferred = [folder / f"{name}{suffix}" for name in names]
     files = [p for p in preferred if p.is_file()][:1] or sorted(folder.glob(f"*{suffix}"))
     if len(files) != 1:
@@ -380,7 +381,7 @@ def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
 
 
 def _snap_to_axes(unit_vector: Array) -> Array:
-    """Unit vector with components within rounding of 0 or ±1 replaced by 0 or ±1."""
+    """Unit vector whose components are exactly 0 or ±1 if they differ only by rounding."""
     nearest = np.round(unit_vector)
     return np.where(np.abs(unit_vector - nearest) < 1e-12, nearest, unit_vector)
 
@@ -405,7 +406,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> Mapping[str, Leg]:
         jacobian = frame_jacobian(model, data, find_frame(model, entry.root, where=here))[:3]
         by_passive = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
         motion = jacobian[:, robot.drive_index].sum(axis=1)
-        motion /= max(float(np.linalg.norm(motion)), 1e-9)
+        motion /= max(float(np.linalg.norm(motion)), 1e-9)  # remains 0 if no drive moves it
         legs[name] = Leg(
             **line,
             axis=read_only(

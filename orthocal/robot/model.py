@@ -270,7 +270,7 @@ class Robot:
 
     @property
     def leg_noun(self) -> str:
-        """Noun for the legs in messages: rods, as on a linear delta, unless they follow slides."""
+        """Noun for the legs in messages: legs if they are parallel to their slides, else rods."""
         return "legs" if all(leg.follows_slide for leg in self.legs.values()) else "rods"
 
     @property
@@ -565,12 +565,12 @@ def require_commanded_tool(robot: Robot) -> tuple[int, ...]:
 
 
 def coordinate_names(model: pin.Model) -> list[str]:
-    """Name of the joint of each joint coordinate, for models whose joints have one coordinate."""
+    """Names of the joints in the order of the joint coordinates; every joint has one."""
     return [str(name) for name in model.names][1:]
 
 
 def joint_axis(model: pin.Model, joint: int) -> Array:
-    """Motion subspace of a joint with one degree of freedom, shape (6,)."""
+    """Twist of a joint with one degree of freedom per unit of its coordinate, shape (6,)."""
     joint_model = model.joints[joint]
     joint_data = joint_model.createData()
     joint_model.calc(joint_data, pin.neutral(model))
@@ -585,7 +585,9 @@ def closure_turns(robot: Robot) -> Mask:
 def drive_keys(
     quantity: str, drives: Sequence[Drive], values: Sequence[float] | None = None
 ) -> str:
-    """Keys of a session with a value of each drive, such as "offsets_mm: [0, 0]", by their units.
+    """Keys of a session with a value of each drive, such as "offsets_mm: [0, 0]".
+
+    Drives with different units have a key for each unit.
 
     Args:
         quantity: First part of the keys: offsets, backlash or home_offset.

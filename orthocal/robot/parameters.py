@@ -40,7 +40,7 @@ def require_prior(name: str, unit: str, std: float) -> None:
     """Check unit and prior standard deviation of a parameter.
 
     Raises:
-        ValueError: Naming the parameter.
+        ValueError: If one of them is invalid; names the parameter.
     """
     if unit not in EDGE_UNITS:
         raise ValueError(f"{name}: unit: found {unit!r}; expected one of {', '.join(EDGE_UNITS)}")
@@ -52,33 +52,31 @@ def require_prior(name: str, unit: str, std: float) -> None:
 class ElementaryError:
     """Elementary error: one parameter of an effect.
 
-    Args:
-        name: Name of the parameter, such as x_slide.offset.
-        kind: "offset" or "scale" of a drive, "translation" or "rotation" of a placement, or the
-            name of another effect.
-        owner: Name of the drive, joint or frame; for other effects of the leg, rod or setup.
-        unit: SI unit: m, rad, 1, 1/K or m/s.
-        prior_std: Standard deviation before the calibration, [unit].
-        of_frame: True if the owner is a frame, False if it is a joint.
-        axis: Component of the twist of a placement, 0 to 5; -1 for errors of other kinds.
-        complete: False for placements that no complete model contains. Other errors are part of the
-            complete model, unless they are redundant. Those of named effects are part of every
-            model.
-        positive: True for a value of at least 0 with a half-normal prior.
-
     Raises:
         ValueError: If the unit is unknown, or the standard deviation no number of at least 0.
     """
 
     name: str
+    """Name of the parameter, such as x_slide.offset."""
     kind: str
+    """`offset` or `scale` of a drive, `translation` or `rotation` of a placement, or the name of
+    another effect."""
     owner: str
+    """Name of the drive, joint or frame. Errors of other effects name a part of the machine; those
+    of each setup have ""."""
     unit: Unit
+    """SI unit."""
     prior_std: float
+    """Standard deviation before the calibration, [unit]."""
     of_frame: bool = False
+    """True if the owner is a frame, False if it is a joint."""
     axis: int = -1
+    """Component of the twist of a placement, 0 to 5; -1 for errors of other kinds."""
     complete: bool = True
+    """False for an error of a placement that no complete model contains. All others are part of it
+    unless they are redundant; those of named effects are part of every model."""
     positive: bool = False
+    """True for a value of at least 0 with a half-normal prior."""
 
     def __post_init__(self) -> None:
         require_prior(self.name, self.unit, self.prior_std)
@@ -171,17 +169,17 @@ class ParameterSet:
 
     @cached_property
     def complete(self) -> tuple[str, ...]:
-        """Elementary errors of the complete model in order, without redundant ones."""
+        """Elementary errors of the complete model, in order."""
         return tuple(n for n in self.of_parts if n not in self.redundant)
 
     @cached_property
     def of_parts(self) -> tuple[str, ...]:
-        """Elementary errors of drives, joints and closure frames, in order."""
+        """Elementary errors of the complete model and redundant ones, in order."""
         return tuple(e.name for e in self.elementary.values() if e.complete)
 
     @cached_property
     def of_effects(self) -> tuple[str, ...]:
-        """Errors of effects other than geometry and drives, which every model contains."""
+        """Errors of effects other than geometry and drives, in order; every model contains them."""
         return tuple(
             e.name
             for e in self.elementary.values()
@@ -216,7 +214,9 @@ class ParameterSet:
         return all(self.elementary[term].kind == "offset" for term, _ in self[name].terms)
 
     def are_scaled(self, name: str) -> bool:
-        """True for rigid-body errors except offsets, whose tolerances one factor scales.
+        """True for a rigid-body parameter (`are_rigid`) that is not an offset.
+
+        The tolerance scale multiplies the tolerances of these parameters.
 
         Raises:
             ParameterError: If the name is unknown.
@@ -250,7 +250,7 @@ class ParameterSet:
         return tuple(name for name in self._parameters if name in chosen)
 
     def without_sums(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Names without sums of elementary errors that are named, too."""
+        """Names without those sums whose elementary errors are also among the names."""
         listed = set(names)
         return tuple(
             n
@@ -259,7 +259,7 @@ class ParameterSet:
         )
 
     def without_terms(self, names: Iterable[str], terms: Set[str]) -> tuple[str, ...]:
-        """Names of parameters that contain none of some elementary errors."""
+        """Names of those parameters that contain none of the elementary errors `terms`."""
         return tuple(n for n in names if not terms & {term for term, _ in self[n].terms})
 
     def select_model(self, model: str) -> tuple[str, ...]:
@@ -293,7 +293,7 @@ class ParameterSet:
         if stated == self.stated:
             return self
         parameters = self._replaced(stated)
-        for key in list(stated):
+        for key in list(stated):  # entries that change nothing are omitted
             without = {k: v for k, v in stated.items() if k != key}
             if self._replaced(without) == parameters:
                 stated = without
@@ -372,7 +372,7 @@ class ParameterSet:
         return result
 
     def expand(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Nonzero elementary errors of parameter values.
+        """Elementary errors of parameter values, without those that are 0.
 
         Args:
             values: Names of parameters, mapped to values, [unit of the parameter].
@@ -451,7 +451,8 @@ def build_parameters(
         further: Parameters in addition to the errors and their sums.
 
     Raises:
-        ParameterError: If a name is unknown or repeated, or terms of a sum differ in unit.
+        ParameterError: If a name is unknown or repeated, a unit is missing or wrong, terms of a sum
+            differ in unit, or a model selects nothing.
     """
     by_name = {e.name: e for e in elementary}
     parameters = {
@@ -487,7 +488,11 @@ def build_parameters(
 def _sum_errors(
     name: str, members: Sequence[str], errors: Mapping[str, ElementaryError]
 ) -> Parameter:
-    """Named sum of elementary errors, with the tolerance of the first term."""
+    """Named sum of elementary errors, with the tolerance of the first term.
+
+    Raises:
+        ParameterError: If a term is unknown or repeated, or the units differ.
+    """
     terms: dict[str, float] = {}
     for member in members:
         term = member.removeprefix("-")
@@ -522,7 +527,11 @@ def _match(pattern: str, names: Collection[str]) -> list[str]:
 
 
 def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
-    """Refuse a key whose unit is not that of the parameter."""
+    """Refuse a key whose unit is not that of the parameter.
+
+    Raises:
+        ParameterError: If the units differ; names the unit that users read.
+    """
     if unit != parameter.unit:
         matched = ", which it matches," if set(key) & set("*?[") else ""
         raise ParameterError(
@@ -536,13 +545,13 @@ def is_offset(name: str) -> bool:
 
 
 def suggest(name: str, names: Iterable[str]) -> str:
-    """Hint with similar names, for messages."""
+    """Hint with at most three similar names, for the end of a message; "" without any."""
     close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     return f"; did you mean {', '.join(close)}?" if close else ""
 
 
 def split_assignment(text: str, form: str, where: str) -> tuple[str, str]:
-    """Key and value of an option such as KEY=VALUE, which may have blanks.
+    """Key and value of an option such as KEY=VALUE, without blanks around them.
 
     Raises:
         ParameterError: If there is no '='.

@@ -22,16 +22,17 @@ from orthocal.robot.model import Robot, closure_row_units
 from orthocal.robot.parameters import AXES, ElementaryError
 
 N_POSTURES = 4
-"""Number of random postures in which effects are evaluated."""
+"""Number of random postures in which sensitivities are evaluated."""
 
 MAX_ATTEMPTS = 200
-"""Largest number of random drive coordinates, some of which cannot be reached."""
+"""Largest number of random drive coordinates that are tried, because some cannot be reached."""
 
 UNLIMITED_TRAVEL = 0.2
-"""Assumed travel of a drive without limits on both sides of its zero, [m, rad]."""
+"""Travel on each side of its zero that is assumed for a drive without limits, [m, rad]."""
 
-SMALLEST_EFFECT = 1e-9
-"""Effect below which an error is redundant, relative to the largest effect of its kind."""
+SMALLEST_SENSITIVITY = 1e-9
+"""Sensitivity below which an error is redundant, relative to the largest of its kind: translations
+or rotations, whose units differ."""
 
 ROW_RANK_TOLERANCE = 1e-8
 """Singular value below which closure rows are linearly dependent, [m per m or rad]."""
@@ -40,12 +41,12 @@ ROW_RANK_TOLERANCE = 1e-8
 def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
     """Names of the placement errors that the tool and the gauges cannot observe.
 
-    Errors of other kinds are never redundant. Without a tool and legs nothing is observed; no error
-    counts as redundant then.
+    Errors of other kinds are never redundant. Without a tool and legs no error counts as redundant,
+    because nothing is observed.
     """
-    errors = [e for e in elementary if e.axis >= 0]
     if robot.tcp is None and not robot.legs:
         return frozenset()
+    errors = [e for e in elementary if e.axis >= 0]
     placements = [robot.placement_of(e) for e in errors]
     owners = list(dict.fromkeys(placements))
     columns = [6 * owners.index(p) + e.axis for p, e in zip(placements, errors, strict=True)]
@@ -55,14 +56,14 @@ def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -
             observed += [rod.root, rod.tip]
     frames = [robot.frame_id(name) for name in dict.fromkeys(observed)]
     masks = _carried_masks(robot, owners, frames)
-    effects = np.zeros(len(errors))
+    largest = np.zeros(len(errors))
     for coordinates in islice(_random_postures(robot), N_POSTURES):
         sensitivity = _sensitivity(robot, owners, frames, masks, coordinates)
-        effects = np.maximum(effects, np.abs(sensitivity).max(axis=0)[columns])
+        largest = np.maximum(largest, np.abs(sensitivity).max(axis=0)[columns])
     rotations = np.array([e.axis >= 3 for e in errors], dtype=np.bool_)
     redundant = np.zeros(len(errors), dtype=np.bool_)
     for kind in (rotations, ~rotations):
-        redundant |= kind & (effects <= SMALLEST_EFFECT * effects[kind].max(initial=0.0))
+        redundant |= kind & (largest <= SMALLEST_SENSITIVITY * largest[kind].max(initial=0.0))
     return frozenset(e.name for e, r in zip(errors, redundant, strict=True) if r)
 
 
@@ -74,7 +75,7 @@ def _random_postures(robot: Robot) -> Iterator[Array]:
     unlimited = ~np.isfinite(upper)
     lower = np.where(unlimited, zero - UNLIMITED_TRAVEL, lower)
     upper = np.where(unlimited, zero + UNLIMITED_TRAVEL, upper)
-    fraction = 0.5
+    fraction = 0.5  # of the travel; reduced until enough postures can be reached
     for _ in range(MAX_ATTEMPTS):
         drives = zero + fraction * (rng.uniform(lower, upper) - zero)
         try:
@@ -117,10 +118,13 @@ def _sensitivity(
 
         dp/dξ = p_ξ − p_q g_q⁺ g_ξ
 
+    Subscripts denote Jacobians of the observed points p and of the closures g, with respect to the
+    placement errors ξ and the passive coordinates q.
+
     Args:
         robot: The robot.
-        owners: Joints and frames with an error ξ, a twist in their frame.
-        observed: Indices of the frames whose origins p are observed.
+        owners: Placements of joints and frames; each has six components of ξ, a twist in its axes.
+        observed: Indices of the frames whose origins are observed.
         masks: Result of `_carried_masks`.
         coordinates: Joint coordinates with closed loops, shape (nv,), [m, rad].
 
@@ -165,7 +169,7 @@ def require_independent_rows(robot: Robot) -> None:
     with errors.
 
     Raises:
-        RobotError: Naming the closures and the rows.
+        RobotError: If rows are missing, or depend on others; names them.
     """
     where, passive = str(robot.yaml), robot.reference_passive
     rows = [(c.name, AXES[row]) for c in robot.closures for row in c.rows]

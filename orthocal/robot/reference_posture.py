@@ -93,7 +93,11 @@ def count_free_motions(robot: Robot) -> int:
 
 
 def _search(robot: Robot, start: Array, movable: Indices) -> Array:
-    """Joint coordinates with closed loops; movable drives are moved only if necessary."""
+    """Joint coordinates with closed loops; movable drives are moved only if necessary.
+
+    Raises:
+        RobotError: If no posture with closed loops is found.
+    """
     free = np.concatenate([movable, robot.passive_index])
     attempts: list[Closing] = []
     for drives_move in (False, True) if movable.size else (False,):
@@ -181,9 +185,10 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     free = np.concatenate([movable, robot.passive_index])
 
     def distances(candidate: Closing) -> Array:
+        """Distance of each movable drive from its zero, [rad] or characteristic lengths."""
         return np.asarray((target - candidate.coordinates)[movable] / scales[movable])
 
-    factor = 1.0
+    factor = 1.0  # reduced after a failed step, doubled after a successful one
     for _ in range(MAX_RETURN_STEPS):
         _, jacobian = robot.evaluate_constraints_at(closing.coordinates)
         motions = _null_space(jacobian[:, free] * scales[free])
@@ -228,7 +233,7 @@ def _null_space(matrix: Array) -> Array:
 
 
 def _remove_full_turns(robot: Robot, coordinates: Array) -> Array:
-    """Coordinates of unlimited passive joints reduced to ±π."""
+    """Coordinates with the angles of unlimited passive joints reduced to ±π."""
     unlimited = np.isinf(coordinate_limits(robot.model)).all(axis=0) & coordinate_turns(robot.model)
     unlimited[robot.drive_index] = False
     turns = np.round(coordinates / (2.0 * np.pi))

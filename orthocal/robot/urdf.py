@@ -66,7 +66,8 @@ RESERVED_NAMES = frozenset({"universe"})
 """Names that Pinocchio reserves."""
 
 LARGEST_PLACE = 1e4
-"""Largest length [m], angle [rad] or scale; loops of metres must close to nanometres."""
+"""Largest length [m], angle [rad] or scale. Far from the origin, rounding errors would exceed the
+tolerance of closed loops."""
 
 LARGEST_URDF = 16 * 2**20
 """Largest size of a URDF file, [bytes]."""
@@ -131,7 +132,7 @@ def load_urdf(
 
 
 def _complete_limits(root: Element) -> list[str]:
-    """Write URDF's default of 0 for absent bounds, which yourdfpy requires.
+    """Write URDF's default of 0 for absent bounds, because yourdfpy requires both.
 
     Returns:
         Names of the joints with neither bound.
@@ -277,7 +278,7 @@ def _check_joint(joint: Element, path: Path) -> None:
     for bound in ("effort", "velocity"):
         if values[bound] is None:
             raise RobotError(f"joint '{name}': its <limit> has no {bound}", where=where)
-    if (values["lower"] or [0.0]) > (values["upper"] or [0.0]):
+    if (values["lower"] or [0.0]) > (values["upper"] or [0.0]):  # lists of one number
         absent = next((b for b in ("lower", "upper") if values[b] is None), "")
         hint = f" ({absent} is 0 by default)" if absent else ""
         raise RobotError(
@@ -367,18 +368,23 @@ def _check_counts(root: Element, path: Path) -> None:
 
 
 def _numbers(element: Element, key: str, count: int, where: str) -> list[float] | None:
-    """Numbers of an attribute; None if it is absent."""
+    """Numbers of an attribute; None if it is absent.
+
+    Raises:
+        RobotError: If their count is wrong, or one is not finite or too large.
+    """
     text = element.get(key)
     if text is None:
         return None
     try:
+        # `float` also accepts digits with underscores, which URDF does not
         values = [float(part) for part in text.split() if "_" not in part]
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(v) for v in values):
         kind = "a finite number" if count == 1 else f"{count} finite numbers"
         raise RobotError(f"{key} is '{text}'; expected {kind}", where=where)
-    # distant limits are common for unlimited joints
+    # limits of joints may be larger than places: large ones are common for unlimited joints
     largest = LARGEST_PLACE if key in _BOUNDED else LARGEST_NUMBER
     if max(map(abs, values)) > largest:
         kind = "a number" if count == 1 else "numbers"
