@@ -7,8 +7,8 @@ the covariance σ² S. X has a column for every free gauge zero. With the prior 
 
 the error of reading i is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ. Deleting the reading
 changes the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ, with the unit vector eᵢ (Cook and Weisberg, Residuals and
-Influence in Regression, 1982, 2.2). S is 1 for single readings. Differences of one setup and cycle share
-postures, so that S has a block for each of these groups.
+Influence in Regression, 1982, 2.2). S is 1 for single readings. Differences of one setup and cycle
+share postures, so that S has a block for each of these groups.
 
 Deleting a setup s changes the estimate, to first order about the solution, by
 
