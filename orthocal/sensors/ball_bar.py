@@ -24,7 +24,7 @@ from pydantic import Field
 from orthocal.arrays import Array, triple
 from orthocal.io.documents import Name, Number
 from orthocal.robot.model import Robot
-from orthocal.sensors.mounting import SCALE, ScaleTolerance
+from orthocal.sensors.mounting import SCALE_STD, ScaleTolerance
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
@@ -48,7 +48,7 @@ SAGITTA = 5e-6
 """Largest deviation of a chord from the arc between two readings, [m]."""
 
 SHORTEST_MM = 5.0
-"""Length of the shortest accepted bar, [mm]; a smaller number has a wrong unit."""
+"""Smallest accepted length, [mm]; a smaller one has a wrong unit."""
 
 LARGEST_MM = 5000.0
 """Largest accepted length and coordinate, [mm]; a larger one has a wrong unit."""
@@ -68,12 +68,12 @@ class BallBarKeys(SetupKeys):
     centre_tolerance_mm: Tolerance = show_tolerance(CENTRE_STD, MM)
     """Tolerance of each coordinate of the fixed ball; 0 if the position is known."""
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Ball at the tool, from the tool centre point, in the tool's frame."""
+    """Position of the ball at the tool, from the tool centre point, in the tool's frame."""
     length_mm: Annotated[Number, Field(ge=SHORTEST_MM, le=LARGEST_MM)]
     """Distance of the balls at reading 0."""
     length_tolerance_mm: Tolerance | Literal["unknown"] = 0.0
     """Tolerance of the length; 0 if it is known."""
-    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE_STD)
     """Tolerance of the dial's scale, dimensionless."""
 
 
@@ -89,10 +89,10 @@ class BallBar(ToolSensor):
     """Prior standard deviation of each coordinate of the fixed ball, [m]."""
     length_std: float = 0.0
     """Prior standard deviation of the length, [m]; 0 if it is known."""
-    scale_std: float = SCALE
+    scale_std: float = SCALE_STD
     """Prior standard deviation of the dial's scale, [1]."""
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Ball at the tool, from the tool centre point, in the tool's frame, [m]."""
+    """Position of the ball at the tool, from the tool centre point, in the tool's frame, [m]."""
     ball: str | None = None
     """Name of the fixed ball that several setups share."""
 
@@ -136,7 +136,7 @@ class BallBar(ToolSensor):
             unknown = self.length_std == UNKNOWN_LENGTH_STD
             tolerance = "unknown" if unknown else show_tolerance(self.length_std, MM)
             keys["length_tolerance_mm"] = tolerance
-        if self.scale_std != SCALE:
+        if self.scale_std != SCALE_STD:
             keys["scale_tolerance"] = show_tolerance(self.scale_std)
         return keys
 
@@ -187,9 +187,10 @@ class BallBar(ToolSensor):
         Returns:
             Tool centre points, shape (n, 3), [m]. Chords deviate from the arc by at most `SAGITTA`.
         """
+        # from the fixed ball to the ball at the tool
         offset = np.array(self.tool) - np.array(self.centre)
         ends = np.array([start + offset, end + offset])
-        if normal is not None:  # about the foot of the fixed ball in the plane
+        if normal is not None:  # the arc is about the foot of the fixed ball in the plane
             height = (ends[0] @ normal) * normal
             ends, offset = ends - height, offset - height
         radii = np.linalg.norm(ends, axis=1)
@@ -197,28 +198,29 @@ class BallBar(ToolSensor):
         step = 2.0 * np.arccos(1.0 - min(SAGITTA / radii.max(), 1.0))
 
         def shares(angle: float) -> Array:
+            """Fractions of an arc at which its corners are, shape (n, 1)."""
             return np.linspace(0.0, 1.0, max(math.ceil(angle / step), 1) + 1)[:, None]
 
         if above and normal is None:
-            polar = np.array([[np.arctan2(y, x), np.arcsin(z)] for x, y, z in (first, last)])
-            motion = polar[1] - polar[0]
-            motion[0] = math.remainder(motion[0], 2.0 * np.pi)
+            angles = np.array([[np.arctan2(y, x), np.arcsin(z)] for x, y, z in (first, last)])
+            motion = angles[1] - angles[0]
+            motion[0] = math.remainder(motion[0], 2.0 * np.pi)  # the shorter way round
             share = shares(float(np.linalg.norm(motion)))
-            azimuth, elevation = (polar[0] + share * motion).T
+            azimuth, elevation = (angles[0] + share * motion).T
             level = np.cos(elevation)
             unit = np.stack(
                 [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1
             )
         else:
             across = last - (first @ last) * first
-            if np.linalg.norm(across) < 1e-9:  # equal or opposite directions
+            if np.linalg.norm(across) < 1e-9:  # equal or opposite: any direction across
                 across = np.linalg.svd(first[None])[2][-1]
                 if normal is not None:
                     across = np.cross(normal, first)
             across /= np.linalg.norm(across)
             angle = np.arctan2(abs(last @ across), first @ last)  # rounding may be negative
             if above:
-                angle -= 2.0 * np.pi
+                angle -= 2.0 * np.pi  # the other way round
             share = shares(abs(angle))
             unit = np.cos(share * angle) * first + np.sin(share * angle) * across
         return np.asarray((radii[0] + share * (radii[1] - radii[0])) * unit - offset)

@@ -38,6 +38,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
 
 INPUTS = ["actuated", "passive", "placements", "zero", "constants", "nuisance"]
+"""Inputs of the functions of a reading (see `CompiledReading`)."""
 
 FUNCTIONS = "reading", "reading jacobian"
 """Names of the functions of a reading."""
@@ -59,17 +60,17 @@ class CompiledReading:
     """Reading h, [m]."""
     jacobian: BatchFunction
     """Reading h, then its derivatives with respect to actuated coordinates, passive coordinates,
-    twists, reference drives and nuisance parameters. Each is one row; the derivative with respect
-    to twists is given by its nonzeros. For a pair, derivatives with respect to the coordinates in
-    the second posture follow."""
+    twists, drives in the reference posture and nuisance parameters. Each is one row; that with
+    respect to the twists contains its nonzeros only. For a pair, derivatives with respect to the
+    coordinates in the second posture follow."""
     expression: ca.Function
     """Function with the outputs of `jacobian` as sparse rows, for use in other expressions."""
     pattern: ReadingPattern
-    """Pattern of the sensors."""
+    """Pattern that the sensors share."""
     pairs: bool
     """Whether a reading belongs to a pair of postures."""
     probe: float | None
-    """Value of the expression at fixed arguments, for a sensor from another package."""
+    """Value of the expression at fixed arguments for a sensor from another package, else None."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
@@ -100,7 +101,8 @@ class ReadingPattern:
         sizes = (condition_size(robot, c) for c in self.conditions)
         self.n_constants = np.size(sensor.constants(robot)) + sum(sizes)
         effect_errors = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
-        self.nuisance_parameters = (*(u.name for u in sensor.nuisance_parameters), *effect_errors)
+        self.nuisance_parameters = (*(p.name for p in sensor.nuisance_parameters), *effect_errors)
+        """Names of the nuisance parameters of the sensor, then of the effects."""
         self._key = (
             identify(robot),
             type(sensor),
@@ -119,9 +121,10 @@ class ReadingPattern:
 
     @property
     def digests(self) -> tuple[str, ...]:
-        """Digests of what the expression depends on, besides the name.
+        """Digests of everything beside the name on which the expression depends.
 
-        Sensors and effects of other packages may use any property of the robot.
+        Sensors and effects of other packages may use any property of the robot, so that the digest
+        of the robot is one of them.
         """
         effects = reading_effects(self.robot)
         kinds: list[type] = [type(self.sensor), *(type(e) for e in effects)]
@@ -166,14 +169,14 @@ def _compile(pattern: ReadingPattern) -> CompiledReading:
 
 
 def _build(pattern: ReadingPattern, name: str) -> ca.Function:
-    """Build one of the functions of a pattern."""
+    """Build the function of a pattern with a name of FUNCTIONS."""
     inputs, outputs = pattern.expressions
     second = SECOND_INPUTS if pattern.frames.in_second else []
     if name == FUNCTIONS[0]:
         value = ca.densify(outputs[0])
         return ca.Function("h", inputs, [value], [*INPUTS, *second], ["h"], OPTIONS)
     variables = ("actuated", "passive", "twists", "zero", "nuisance", *second)
-    labels = ["h", *(f"by_{name}" for name in variables)]
+    labels = ["h", *(f"by_{variable}" for variable in variables)]
     return ca.Function("jacobian", inputs, outputs, [*INPUTS, *second], labels, OPTIONS)
 
 
@@ -186,6 +189,7 @@ def _express(pattern: ReadingPattern) -> tuple[list[ca.SX], list[ca.SX]]:
     robot = pattern.robot
     here: RobotFunctions = robot_functions(robot)
     there = here.reference
+    # machine in one posture and index of a frame, in the order of the poses of `_sensor_expression`
     trees = [
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
@@ -288,7 +292,7 @@ def reading_conditions(robot: Robot, sensor: Sensor) -> tuple[Condition, ...]:
 
 
 def _probe(pattern: ReadingPattern) -> float:
-    """Reading of a sensor at fixed arguments, which is equal for equal expressions."""
+    """Reading of a sensor at fixed arguments; equal expressions give equal readings."""
     _, symbols, h = _sensor_expression(pattern)
     rng = np.random.default_rng(0)
     values = [ca.DM(rng.uniform(0.1, 1.0, s.shape)) for s in symbols]

@@ -36,9 +36,9 @@ PARALLEL_DEG = 1.0
 
 @lru_cache(maxsize=CACHE_SIZE)
 def direction_vector(direction: Direction) -> Array:
-    """Unit vector of a growing reading in the world frame, shape (3,); 0 for the vector 0.
+    """Unit vector of a direction in the world frame, shape (3,); 0 for the vector 0.
 
-    The array is read-only, because it is shared by all calls.
+    The array is read-only, because all calls share it.
     """
     vector = np.array(DIRECTIONS[direction] if isinstance(direction, str) else direction)
     if vector.any() and not isinstance(direction, str):
@@ -50,7 +50,7 @@ def direction_vector(direction: Direction) -> Array:
 
 @lru_cache(maxsize=CACHE_SIZE)
 def side_vector(axis: tuple[float, float, float], direction: Direction) -> Array:
-    """Unit vector across the axis of a leg and a direction, shape (3,), read-only."""
+    """Unit vector perpendicular to the axis of a leg and to a direction, shape (3,), read-only."""
     side = np.cross(axis, direction_vector(direction))
     side /= np.linalg.norm(side)
     side.flags.writeable = False
@@ -65,6 +65,7 @@ def direction_name(direction: Direction) -> str:
     for name, axis in DIRECTIONS.items():
         if unit @ axis > ALONG_AXIS:
             return name
+    # adding 0 removes the sign of a negative zero
     return f"({', '.join(f'{round(v, 9) + 0.0:.3g}' for v in direction)})"
 
 

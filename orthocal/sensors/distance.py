@@ -21,7 +21,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.ball_bar import LARGEST_MM, Coordinate, Tolerance
-from orthocal.sensors.mounting import SCALE, ScaleTolerance
+from orthocal.sensors.mounting import SCALE_STD, ScaleTolerance
 from orthocal.sensors.protocol import (
     Contact,
     Frames,
@@ -41,7 +41,7 @@ class DistanceKeys(SetupKeys):
     """Measured width of the pillar that the calliper includes."""
     width_tolerance_mm: Tolerance = 0.0
     """Tolerance of the width; 0 if it is known."""
-    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE_STD)
     """Tolerance of the scale of calliper and print, dimensionless; setups with one gauge share the
     error."""
 
@@ -54,7 +54,7 @@ class Distance(ToolSensor):
     """Width of the pillar, [m]."""
     width_std: float = 0.0
     """Prior standard deviation of the width, [m]; 0 if it is known."""
-    scale_std: float = SCALE
+    scale_std: float = SCALE_STD
     """Prior standard deviation of the scale, [1]."""
 
     kind: ClassVar[str] = "distance"
@@ -83,7 +83,7 @@ class Distance(ToolSensor):
             keys["width_mm"] = to_mm(self.width)
         if self.width_std:
             keys["width_tolerance_mm"] = show_tolerance(self.width_std, MM)
-        if self.scale_std != SCALE:
+        if self.scale_std != SCALE_STD:
             keys["scale_tolerance"] = show_tolerance(self.scale_std)
         return keys
 

@@ -51,7 +51,7 @@ from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM, show_mm, to_mm
 
 Matrix = Any
-"""Symbols or numbers of CasADi, or arrays."""
+"""Matrix of CasADi, of symbols or numbers, or array of NumPy."""
 
 SectionForm = Literal["coordinate_mm", "from_root_mm", "fraction"]
 """Key that states a section."""
@@ -71,7 +71,7 @@ BESIDE_ROUNDING = 1e-5
 """Largest component of `beside` along leg or plunger that may be a rounding error, [m]."""
 
 LATERAL_DECIMALS = 9
-"""Decimals of the lateral position of a centred ball, [m]."""
+"""Decimals of the lateral position of a centred ball in m; further ones are rounding errors."""
 
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
@@ -115,6 +115,7 @@ class LegKeys(MountingKeys, SetupKeys):
 
 
 def _is_number(value: object) -> bool:
+    """True for a finite number; a bool, which Python counts as an integer, is none."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -156,16 +157,24 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class LegIndicator:
-    """Indicator on the centre line of a leg, or with a blade on one of its rods."""
+    """Indicator on the centre line of a leg, or with a blade on one of its rods.
+
+    Raises:
+        ValueError: If the tip is a ball, which needs a `BallIndicator`, or the reverse.
+    """
 
     leg: str
+    """Name of the measured leg."""
     direction: Direction
     """Direction of a growing reading: x, y, z, -x, -y or -z of the world frame, or a vector."""
     section: Section
+    """Section in which the gauge touches."""
     mounting: Mounting = USUAL
+    """Mounting uncertainty."""
     rod: str | None = None
     """Rod that the tip touches; None for the centre line of the leg."""
     tip: Tip = EDGE
+    """Tip of the plunger; EDGE for the centre line."""
     beside: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Displacement of the tip from the nominal rod in the mechanical zero, shape (3,), [m]."""
 
@@ -173,7 +182,7 @@ class LegIndicator:
     keys: ClassVar[type[SetupKeys]] = LegKeys
     ideal: ClassVar[str] = "parallel"
     touch: ClassVar[Callable[..., ca.SX]] = touch_by_blade
-    """Function of the reading of the tip on a rod."""
+    """Function of a rod and the tip that returns the reading, such as `touch_by_blade`."""
 
     def __post_init__(self) -> None:
         if (self.tip.form == "ball") != isinstance(self, BallIndicator):
@@ -256,7 +265,11 @@ class LegIndicator:
             self._require_rod(self.rod, robot, where)
 
     def _require_rod(self, rod: str, robot: Robot, where: str) -> None:
-        """Refuse an unknown rod, and a displacement that is not across leg and plunger."""
+        """Refuse an unknown rod, and a displacement that is not across leg and plunger.
+
+        Raises:
+            SessionError: If one of them does not fit; names the key.
+        """
         rods, side = robot.legs[self.leg].rods, self._side(robot)
         if rod not in rods:
             hint = f"; rods: {', '.join(rods)}" if rods else ": it has none in the robot's YAML"
@@ -321,8 +334,8 @@ class LegIndicator:
         if self.rod is not None:
             rod = leg.rods[self.rod]
             radius = rod.radius + self.tip.radius
-            share = self.share_at_zero(robot, rod)
-            point = rod.reference_root + share * (rod.reference_tip - rod.reference_root)
+            fraction = self.fraction_at_zero(robot, rod)
+            point = rod.reference_root + fraction * (rod.reference_tip - rod.reference_root)
             across = point - (leg.axis @ point) * leg.axis + self.beside
         direction, side = direction_vector(self.direction), self._side(robot)
         return np.array([*direction, plane, float(from_root), *leg.axis, *side, *across, radius])
@@ -344,7 +357,7 @@ class LegIndicator:
         del robot
         root, end = (pose.position for pose in view.frames)
         c = view.constants
-        direction, axis, side, start = _place(c, [pose.position for pose in view.at_zero])
+        direction, axis, side, start = _place_gauge(c, [pose.position for pose in view.at_zero])
         shift, plunger, edge, scale = mount(
             self.nuisance_parameters, view.nuisance, direction=direction, side=side, axis=axis
         )
@@ -357,13 +370,13 @@ class LegIndicator:
         These are points of the rod's surface, or of the centre line in the plane of the section.
         """
         constants = self.constants(robot)
-        direction, axis, side, start = _place(constants, [pose[:3, 3] for pose in at_zero])
+        direction, axis, side, start = _place_gauge(constants, [pose[:3, 3] for pose in at_zero])
         roots, ends = (pose[:, :3, 3] for pose in frames)
         if self.rod is None:
-            share = ((start - roots) @ axis) / ((ends - roots) @ axis)
-            points, tip = roots + share[:, None] * (ends - roots), None
+            fraction = ((start - roots) @ axis) / ((ends - roots) @ axis)
+            points, tip = roots + fraction[:, None] * (ends - roots), None
             length = robot.legs[self.leg].length
-            problems = [_end_problem("leg", t * length, length) for t in share.tolist()]
+            problems = [_end_problem("leg", t * length, length) for t in fraction.tolist()]
         else:
             tip = TouchingTip(
                 self.tip.radius, None if self.tip.form == "ball" else side, self.tip.width
@@ -402,7 +415,9 @@ class LegIndicator:
         lateral = np.einsum("ki,ki->k", across, start - roots) / np.linalg.norm(across, axis=1)
         centres = start + h[:, None] * direction
         if self.tip.form == "blade":
-            # the edge is a radius away from the rod's axis, along the normal of both
+            # The edge is a radius away from the rod's axis, along the normal n of both. With the
+            # edge e and the axis u, the root is centre + s₀ e − s₁ u + s₂ n: the contact is s₀ from
+            # the middle of the blade and s₁ from the root.
             normals = np.cross(side, units)
             normals *= (np.sign(normals @ direction) / np.linalg.norm(normals, axis=1))[:, None]
             edges = np.broadcast_to(side, units.shape)
@@ -417,7 +432,7 @@ class LegIndicator:
         distances = np.einsum("ki,ki->k", feet - roots, units)
         problems = []
         for k, distance in enumerate(distances.tolist()):
-            if not np.isfinite(h[k]):
+            if not np.isfinite(h[k]):  # of a ball that passes the rod
                 surface[k] = start
                 problems.append(
                     f"the ball would pass the rod: it is {abs(lateral[k]) / MM:.1f} mm beside its "
@@ -467,8 +482,8 @@ class LegIndicator:
             )
         return (value * leg.length if form == "fraction" else value), True
 
-    def share_at_zero(self, robot: Robot, rod: Rod) -> float:
-        """Section as a fraction of a nominal rod from its root, in the mechanical zero."""
+    def fraction_at_zero(self, robot: Robot, rod: Rod) -> float:
+        """Position of the section along a nominal rod in the mechanical zero, from 0 to 1 (tip)."""
         leg = robot.legs[self.leg]
         plane, from_root = self.plane(robot)
         coordinate = plane + (float(leg.axis @ leg.reference_root) if from_root else 0.0)
@@ -500,7 +515,9 @@ class BallIndicator(LegIndicator):
             robot: The robot.
         """
         at_rod = replace(self, beside=(0.0, 0.0, 0.0))
-        direction, _, side, start = _place(at_rod.constants(robot), [p[:3, 3] for p in at_zero])
+        direction, _, side, start = _place_gauge(
+            at_rod.constants(robot), [pose[:3, 3] for pose in at_zero]
+        )
         root, end = (pose[0, :3, 3] for pose in frames)
         normal = np.cross(end - root, direction)
         distance = float((root - start) @ normal / (side @ normal))
@@ -525,7 +542,11 @@ def _end_problem(part: str, distance: float, length: float) -> str:
 
 
 def _coordinate_plane(leg: Leg, value: float, where: str) -> float:
-    """Coordinate along the leg's axis of a plane at a world coordinate, [m]."""
+    """Coordinate along the leg's axis of a plane at a world coordinate, [m].
+
+    Raises:
+        SessionError: If the leg is not along a world axis.
+    """
     axis = int(np.abs(leg.axis).argmax())
     if abs(leg.axis[axis]) < 1.0 - 1e-9:
         raise SessionError(
@@ -535,12 +556,19 @@ def _coordinate_plane(leg: Leg, value: float, where: str) -> float:
     return float(np.sign(leg.axis[axis]) * value)
 
 
-def _place(constants: Matrix, at_zero: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Direction, axis of the leg, edge, and position of the tip at reading 0, shape (3,) each.
+def _place_gauge(
+    constants: Matrix, at_zero: Sequence[Matrix]
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Nominal gauge from the constants of its expression.
 
     Args:
-        constants: Constants of `LegIndicator.constants`.
-        at_zero: Root of the leg in the reference posture, shape (3,), [m], if drives alone move it.
+        constants: Result of `LegIndicator.constants`.
+        at_zero: Root of the leg in the reference posture, shape (3,), [m], if drives alone move it;
+            otherwise empty.
+
+    Returns:
+        Unit vectors of plunger, leg and blade's edge, and position of the tip at reading 0, [m];
+        shape (3,) each.
     """
     direction, plane, axis = constants[:3], constants[3], constants[5:8]
     for root in at_zero:
@@ -550,6 +578,6 @@ def _place(constants: Matrix, at_zero: Sequence[Matrix]) -> tuple[Matrix, Matrix
 
 @cache
 def _touch_function(touch: Callable[..., ca.SX]) -> ca.Function:
-    """Reading of a form of tip as a function of rods, one per column."""
-    symbols = [ca.SX.sym("s", n) for n in (3, 3, 1, 3, 3, 3)]
+    """Numeric function of the reading of a tip; arguments may have a column for each posture."""
+    symbols = [ca.SX.sym("s", n) for n in (3, 3, 1, 3, 3, 3)]  # as in `touch_by_blade`
     return ca.Function("touching", symbols, [touch(*symbols)])

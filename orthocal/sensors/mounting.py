@@ -26,8 +26,8 @@ DIRECTION_STD = 10 * MRAD
 POSITION_STD = 0.5 * MM
 """Prior standard deviation of a position measured with a ruler, along or across the leg, [m]."""
 
-SCALE = 0.002
-"""Prior standard deviation of the scale of a dial, [1]: the lead of its rack."""
+SCALE_STD = 0.002
+"""Prior standard deviation of the scale of a dial, [1], from the lead error of its rack."""
 
 SQUARE_STD = 0.1 * MRAD
 """Prior standard deviation of the squareness of a block, [rad]."""
@@ -35,6 +35,7 @@ SQUARE_STD = 0.1 * MRAD
 LARGEST_TOLERANCE_MM = 40.0
 LARGEST_TOLERANCE_MRAD = 400.0
 LARGEST_SCALE = 0.4
+"""Largest accepted tolerances of positions, directions and scale; larger ones have a wrong unit."""
 
 ScaleTolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)]
 """Tolerance of the scale of a gauge, dimensionless."""
@@ -50,7 +51,7 @@ class MountingKeys(Keys):
     section_tolerance_mm: Millimetres = show_tolerance(POSITION_STD, MM)
     lateral_tolerance_mm: Millimetres = show_tolerance(POSITION_STD, MM)
     """Lateral position of a ball; other tips have none."""
-    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE_STD)
     """Scale of the dial: one for all setups with the same gauge."""
     stand: Name | None = None
     """Square block that several setups of this leg share, with its roll."""
@@ -78,7 +79,7 @@ class Mounting:
     """Position along the leg, [m]."""
     lateral: float = POSITION_STD
     """Position across leg and plunger, [m]."""
-    scale: float = SCALE
+    scale: float = SCALE_STD
     """Scale of the dial, [1]."""
     stand: str | None = None
     """Name of the square block."""

@@ -55,12 +55,14 @@ GROSS_RESIDUAL = 1 * MM
 fit errs by micrometres."""
 
 GROSS_RATIO = 0.1
-"""Largest ratio of the RMS residuals without and with excluded points."""
+"""RMS residual without the excluded points, relative to that with them, below which an exclusion
+applies."""
 
 FEWEST_CONSISTENT = 4
-"""Fewest points of a fit without others. Three fit almost any other three."""
+"""Fewest points that remain after exclusions, because three points fit almost any other three."""
 
 AXES = "xyz"
+"""Axes of the station's frame."""
 
 Coordinate = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
 Vector3 = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
@@ -112,7 +114,9 @@ class Points(ToolSensor):
     frame_std: tuple[float, float] = ABOUT_FIT
     """Prior standard deviations of the station's position and rotation, [m] and [rad]."""
     station: str | None = None
+    """Name of the station that several setups share."""
     scale_std: float = 0.0
+    """Prior standard deviation of the scale, [1]."""
     covariance: tuple[Triple, Triple, Triple] | None = None
     """Covariance of the coordinates of a point, [m²]; None for the standard deviation of the
     gauge."""
@@ -192,8 +196,8 @@ class Points(ToolSensor):
     def split(self) -> dict[str, tuple[Points, float | None]]:
         """The three sensors by label, each with the standard deviation of its reading, [m].
 
-        It is None if the standard deviation of the gauge applies. Without correlation the sensors
-        read the coordinates of the station.
+        It is None without a covariance: then the standard deviation of the gauge applies. Without
+        correlation the sensors read x, y and z of the station, otherwise its principal axes.
         """
         if self.covariance is None:
             return {k: (replace(self, along=_unit(i)), None) for i, k in enumerate(AXES)}
@@ -318,7 +322,7 @@ def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
 
 
 def _determine_pose(points: Array) -> bool:
-    """True for three or more points that do not lie on a line."""
+    """True for three or more points that do not lie on a line, shape (n, 3), [m]."""
     singular_values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return len(points) >= 3 and bool(singular_values[1] > 1e-3 * singular_values[0])
 
@@ -327,8 +331,9 @@ def _consistent_points(points: Array, targets: Array) -> Indices:
     """Indices of the points without those that contradict the others grossly.
 
     Points are removed one by one, each time the one without which the RMS residual is smallest.
-    A removal applies if the RMS residual was above GROSS_RESIDUAL and falls below GROSS_RATIO of
-    it. Errors of the machine change smoothly with the position, so that no removal does this.
+    While the residual is above GROSS_RESIDUAL, removals apply if they reduce it below GROSS_RATIO
+    of its value. Errors of the machine do not cause such reductions, because they change smoothly
+    with the position. At most a third of the points is removed.
 
     Args:
         points: Points in the frame of the station, shape (n, 3), [m].
@@ -353,7 +358,7 @@ def _rms_residuals(points: Array, targets: Array) -> Array:
 
     With the centred points p and targets q, H = Σ p qᵀ and its singular values σ, the squared
     residuals of the best fit sum to Σ |p|² + Σ |q|² − 2 (σ1 + σ2 + sign(det H) σ3). Without one of
-    n points, the sums lose n / (n − 1) times its terms.
+    n points, whose centroid differs, each sum loses n / (n − 1) times the term of this point.
 
     Args:
         points: Points in the frame of the station, shape (n, 3), [m].
@@ -368,7 +373,7 @@ def _rms_residuals(points: Array, targets: Array) -> Array:
     count = np.full(len(points) + 1, len(points) - 1)
     count[0] += 1
     loss = len(points) / count
-    loss[0] = 0.0
+    loss[0] = 0.0  # the first residual is that of all points; the term beside it does not count
     products = terms.sum(axis=0) - loss[:, None, None] * np.concatenate([terms[:1], terms])
     sums = squares.sum() - loss * np.concatenate([squares[:1], squares])
     singular_values = np.linalg.svd(products, compute_uv=False)
@@ -378,4 +383,5 @@ def _rms_residuals(points: Array, targets: Array) -> Array:
 
 
 def _unit(i: int) -> Triple:
+    """Unit vector of axis i."""
     return triple(np.eye(3)[i].tolist())

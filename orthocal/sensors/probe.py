@@ -1,9 +1,9 @@
 """Touch probe or nozzle on a bed: height of the tip above the surface.
 
-A reading is the height of the tip above the surface in its posture. In a plan it is the coordinate
-of the posture minus that at the trigger. If the posture consists of the drive coordinates at the
-trigger, as in a printer's log, the reading is 0. The surface is a plane of unknown tilt, with or
-without a smooth deviation from flat. Heights are positive against the direction of the probe:
+In a plan the reading is the coordinate of the posture minus that at the trigger. If the posture
+consists of the drive coordinates at the trigger, as in a printer's log, the reading is 0. The
+surface is a plane of unknown tilt, with or without a smooth deviation from flat. Heights are
+positive against the direction of the probe:
 
     h = −(n · q)/(n · u) − f(q) − o
 
@@ -110,7 +110,9 @@ class Probe(ToolIndicator):
             "direction_tolerance_mrad": show_tolerance(a.direction_std, MRAD),
             "trigger_tolerance_mm": show_tolerance(self.trigger_std, MM),
         }
-        return {**keys, **({"tool_mm": [to_mm(v) for v in self.tool]} if any(self.tool) else {})}
+        if any(self.tool):
+            keys["tool_mm"] = [to_mm(v) for v in self.tool]
+        return keys
 
     def describe(self) -> str:
         """Short description with the direction of the probe."""
@@ -137,13 +139,13 @@ class Probe(ToolIndicator):
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Direction and form of the surface, and the trigger height."""
+        """Direction and form of the surface and trigger height, if their std is above 0."""
         surface = (replace(p, fixed=True) for p in self.artefact.nuisance_parameters)
-        trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
-        return (*surface, *trigger)
+        trigger = NuisanceParameter("trigger", "m", self.trigger_std)
+        return tuple(p for p in (*surface, trigger) if p.prior_std > 0.0)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
-        """Height of the surface, [m]."""
+        """Height of the tip above the surface, [m]."""
         errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
         indicated = ToolIndicator.expression(self, view, robot)
         return ca.SX(-indicated - errors.get("trigger", 0.0))

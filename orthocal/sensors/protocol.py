@@ -60,6 +60,7 @@ class NuisanceParameter(InUnit):
     name: str
     """Name that is unique within its setup, or within the setups that share the parameter."""
     unit: Unit
+    """SI unit."""
     prior_std: float
     """Prior standard deviation, [unit]; the prior mean is 0."""
     shared_by: str | None = None
@@ -185,8 +186,8 @@ class Sensor(Protocol):
     # mounting_steps: tuple[str, ...], optional: instructions for mounting the sensor in the
     # alignment posture (`mounting_steps`)
 
-    # states_readings: ClassVar[bool], optional: whether readings are prescribed, not measured, such
-    # as the height of a bed (`states_readings`)
+    # states_readings: ClassVar[bool], optional: whether readings are prescribed, such as the height
+    # of a bed, and the postures measured (`states_readings`)
 
     # equal_readings: ClassVar[bool], optional: whether different postures usually have equal
     # readings, such as equal lengths of a print; by default if readings are prescribed. Then equal
@@ -313,7 +314,7 @@ def place_point(poses: Array, point: Sequence[float] | Array) -> Array:
 
 
 def _optional(sensor: Sensor, name: str, default: Value) -> Value:
-    """Attribute that a sensor need not have."""
+    """Attribute of a sensor, or the default if it has none."""
     value: Value = getattr(sensor, name, default)
     return value
 
@@ -324,7 +325,7 @@ def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:
 
 
 def tool_path(sensor: Sensor) -> ToolPath | None:
-    """Path of the tool that a sensor prescribes; None for a straight one."""
+    """Function of the path that a sensor prescribes for the tool; None for a straight one."""
     return _optional(sensor, "path", None)
 
 
@@ -352,7 +353,7 @@ def stated_dimensions(sensor: Sensor) -> Mapping[str, Sensor]:
 
 
 def mirrored_parameters(sensor: Sensor) -> tuple[NuisanceParameter, ...]:
-    """Nuisance parameters of a vector that readings may determine only up to a sign."""
+    """Nuisance parameters that form a vector and that readings may determine only up to a sign."""
     names: tuple[str, ...] = _optional(sensor, "mirrored", ())
     return tuple(p for p in sensor.nuisance_parameters if p.name in names) if names else ()
 
@@ -378,12 +379,12 @@ def is_difference(minus: str | None, sensor: Sensor) -> bool:
 
 
 def states_readings(sensor: Sensor) -> bool:
-    """True if readings are prescribed, not measured: the postures are."""
+    """True if readings are prescribed, such as the height of a bed, and the postures measured."""
     return _optional(sensor, "states_readings", False)
 
 
 def equal_readings(sensor: Sensor) -> bool:
-    """True if equal readings of different postures are no anomaly."""
+    """True if equal readings in different postures are usual, and no anomaly."""
     return _optional(sensor, "equal_readings", states_readings(sensor))
 
 

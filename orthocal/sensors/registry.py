@@ -27,8 +27,12 @@ GROUP = "orthocal.sensors"
 """Group of the entry points by which installed packages offer kinds of sensor."""
 
 
-def _read_sensor(name: str, offered: type[Sensor]) -> type[Sensor]:
-    """Require that an offered class is a sensor of the kind of its entry point."""
+def _require_sensor(name: str, offered: type[Sensor]) -> type[Sensor]:
+    """The offered class, which must be a sensor with the kind of its entry point.
+
+    Raises:
+        TypeError: If it is not.
+    """
     kind, keys = (getattr(offered, attribute, None) for attribute in ("kind", "keys"))
     if kind != name or not isinstance(keys, type) or not issubclass(keys, SetupKeys):
         raise TypeError(f"{offered.__qualname__} is not a sensor with kind = '{name}' and keys")
@@ -45,21 +49,21 @@ BUILT_IN = {
 }
 """Built-in kinds and their classes, which are imported on first use."""
 
-_SENSORS = Registry[type[Sensor]](GROUP, "sensor", _read_sensor, BUILT_IN)
+_SENSORS = Registry[type[Sensor]](GROUP, "sensor", _require_sensor, BUILT_IN)
 
 
 def register_sensor(sensor: type[Sensor]) -> None:
     """Register a sensor; it replaces a sensor of the same kind.
 
     Raises:
-        TypeError: If it is no class of a sensor.
+        TypeError: If it is no class of a sensor with `kind` and `keys`.
     """
     require_kind(sensor, type, expected="a class with the members of Sensor")
     _SENSORS.register(getattr(sensor, "kind", ""), sensor)
 
 
 def unregister_sensor(kind: str) -> None:
-    """Remove a registered kind of sensor."""
+    """Remove a registered kind of sensor; a built-in kind that it replaced returns."""
     _SENSORS.unregister(kind)
 
 
@@ -86,7 +90,8 @@ def read_setup(
         gauge: Keys and values that the gauge states for all its setups.
 
     Raises:
-        OrthocalError: Of kind `error`, if a key is wrong; names the key.
+        OrthocalError: Of kind `error`, if the kind of sensor is unknown, or a key is wrong; names
+            the key.
     """
     name = data.get("sensor", DEFAULT)
     kind = _SENSORS.find(name, where=f"{where}: {under}.sensor", error=error)
@@ -100,13 +105,17 @@ def read_setup(
 
 
 def write_sensor(sensor: Sensor) -> dict[str, Any]:
-    """Keys of a sensor in a document."""
+    """Keys of a sensor for a document, without the default kind."""
     kind = {} if sensor.kind == DEFAULT else {"sensor": sensor.kind}
     return {**kind, **sensor.to_keys()}
 
 
 def _read_recorded(data: object) -> Sensor:
-    """Sensor from plain data; raises ValueError("KEY|PROBLEM")."""
+    """Sensor from plain data.
+
+    Raises:
+        ValueError: If they are invalid, as "KEY|PROBLEM".
+    """
     if not isinstance(data, Mapping):
         raise ValueError("expected keys and values")
     try:

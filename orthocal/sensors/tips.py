@@ -55,7 +55,7 @@ def touch_by_ball(
     direction: ca.SX,
     edge: ca.SX | None = None,
 ) -> ca.SX:
-    """Reading of an indicator with a ball, [m]; NaN if the ball passes the rod.
+    """Reading of an indicator with a ball, [m]; NaN if the ball passes the rod without contact.
 
     Args:
         point: Point of the rod's axis, shape (3,), [m].
@@ -101,10 +101,11 @@ class Tip:
     """Tip of a plunger.
 
     Raises:
-        ValueError: If the form is unknown, or a size is negative.
+        ValueError: If the form is unknown, a size is negative or not finite, or a ball has none.
     """
 
     form: Literal["ball", "blade"]
+    """Form of the tip."""
     radius: float
     """Radius of the ball, or of an edge that is a pin, [m]."""
     width: float = 0.0

@@ -2,8 +2,8 @@
 
 The artefact is clamped to the table. Its surface is a plane with normal n, nominally the direction
 d of the plunger in the reference posture. The tip q and the plunger's direction u move with the
-tool. Where the zero is free, q₀ is the tip in the reference posture of the nominal machine, else
-the origin of the world frame:
+tool. The point q₀ of the nominal surface is the tip in the reference posture of the nominal machine
+if the gauge zero is free, otherwise the origin of the world frame:
 
     h = (1 + s) ((n · (q - q₀) + H) / (n · u) + f(q))
 
@@ -32,7 +32,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import Keys, Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.direction import direction_vector
-from orthocal.sensors.mounting import SCALE, Millimetres, Milliradians, ScaleTolerance, rotate
+from orthocal.sensors.mounting import SCALE_STD, Millimetres, Milliradians, ScaleTolerance, rotate
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
@@ -85,6 +85,8 @@ class _ArtefactKeys(Keys):
 
 
 class _EdgeKeys(_ArtefactKeys):
+    """Keys of an artefact with an edge along an axis."""
+
     along: Axis
     length_mm: Length = LENGTH_MM
     straight_tolerance_mm: Millimetres = 0.0
@@ -145,7 +147,7 @@ class ToolIndicatorKeys(SetupKeys):
     artefact: ArtefactKeys
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Tip of the plunger at reading 0, from the tool centre point, in the tool's frame."""
-    scale_tolerance: ScaleTolerance = show_tolerance(SCALE)
+    scale_tolerance: ScaleTolerance = show_tolerance(SCALE_STD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,23 +158,26 @@ class Artefact:
     along: str | None = None
     """Axis of an edge."""
     name: str | None = None
+    """Name of an artefact that several setups share."""
     length: float = LENGTH_MM * MM
     """Used length, [m]."""
     direction_std: float = ALIGNMENT_STD
-    """Yaw and roll, [rad]."""
+    """Prior standard deviation of yaw and roll, [rad]."""
     form_std: float = 0.0
-    """Deviation from straight or flat at its ends, [m]."""
+    """Prior standard deviation of the deviation from straight or flat at the ends, [m]."""
     form_degree: int = 2
-    """Largest degree of the deviations from flat. Their standard deviation falls as 1/n² with the
-    degree n, because the surface is smooth."""
+    """Largest degree n of the deviations from flat. Their prior standard deviations decrease as
+    1/n², because the surface is smooth."""
     square_std: float = 0.0
-    """Right angle of a square, [rad]."""
+    """Prior standard deviation of the right angle of a square, [rad]."""
     reversed: bool = False
+    """True if the artefact is turned over relative to its other setups."""
     bed: bool = False
     """True for a plate that is the bed of the machine."""
     height: float = 0.0
     """Height of a gauge block, [m]."""
     height_std: float = 0.0
+    """Prior standard deviation of this height, [m]."""
     table: float = 0.0
     """Coordinate of the tool centre point along the plunger while the tip touches the plane beside
     the block, [m]."""
@@ -193,6 +198,7 @@ class Artefact:
         arm = None if owner is None else f"{owner}.{self.along}"
         is_edge = self.along is not None
         forms = STRAIGHT if is_edge else flat_terms(self.form_degree)
+        # the last two characters of flat_JK are the degrees along both axes
         share = np.array([1.0 if is_edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
         form_std = self.form_std * share / np.linalg.norm(share)
         yaw_owner = placement if self.kind == "square" else None
@@ -218,7 +224,7 @@ class ToolIndicator(ToolSensor):
     artefact: Artefact
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Tip of the plunger at reading 0, from the tool centre point, in the tool's frame, [m]."""
-    scale_std: float = SCALE
+    scale_std: float = SCALE_STD
     """Prior standard deviation of the dial's scale, [1]."""
 
     kind: ClassVar[str] = "tool_indicator"
@@ -288,7 +294,7 @@ class ToolIndicator(ToolSensor):
         keys: dict[str, Any] = {"direction": self.direction, "artefact": artefact}
         if any(self.tool):
             keys["tool_mm"] = [to_mm(v) for v in self.tool]
-        if self.scale_std != SCALE:
+        if self.scale_std != SCALE_STD:
             keys["scale_tolerance"] = show_tolerance(self.scale_std)
         return keys
 
@@ -364,7 +370,8 @@ class ToolIndicator(ToolSensor):
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and errors of the artefact and scale of the dial, if their std is above 0."""
         scale = NuisanceParameter("scale", "1", self.scale_std, of_gauge=True)
-        return (*self.artefact.nuisance_parameters, *((scale,) * (self.scale_std > 0.0)))
+        parameters = (*self.artefact.nuisance_parameters, scale)
+        return tuple(p for p in parameters if p.prior_std > 0.0)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Reading with the gauge zero at 0, [m]."""
@@ -378,6 +385,7 @@ class ToolIndicator(ToolSensor):
         q = tool.position + tool.rotation @ tip
         yaw = errors.get("yaw", 0.0) + share * errors.get("square", 0.0)
         normal = rotate(rotate(plunger, along, ca.SX(errors.get("roll", 0.0))), across, ca.SX(yaw))
+        # above half of the block's height the tip is on the block, below beside it
         on_block = level - ca.dot(plunger, tool.position) > 0.5 * height
         block = ca.if_else(on_block, height + errors.get("height", 0.0), 0.0)
         block = ca.if_else(height > 0.0, block, 0.0)
@@ -433,7 +441,7 @@ class ToolIndicator(ToolSensor):
 
 
 def _form(errors: Mapping[str, ca.SX], s: ca.SX, t: ca.SX) -> ca.SX:
-    """Deviation of an artefact from straight or flat, [m].
+    """Deviation f of an artefact from straight or flat, [m].
 
     Args:
         errors: Nuisance parameters by name.
@@ -451,7 +459,7 @@ def _form(errors: Mapping[str, ca.SX], s: ca.SX, t: ca.SX) -> ca.SX:
 
 
 def _legendre(degree: int, x: ca.SX) -> ca.SX:
-    """Legendre polynomial, by Bonnet's recursion."""
+    """Legendre polynomial of a degree at x, by Bonnet's recursion."""
     previous, current = ca.SX(0.0), ca.SX(1.0)
     for n in range(degree):
         previous, current = current, ((2 * n + 1) * x * current - n * previous) / (n + 1)

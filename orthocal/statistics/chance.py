@@ -42,13 +42,13 @@ def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) 
 
 
 def chance_of_equal_readings(equal: int, count: int, *, sigma: float, step: float) -> float:
-    """Probability that at least some of a number of repeated readings are equal to the last digit.
+    """Probability that at least `equal` of `count` repeated readings are equal by chance.
 
-    Two readings of one quantity differ by d with standard deviation √2 σ before they are rounded.
-    Then they are equal with probability E[max(0, 1 − |d|/step)].
+    A repeated reading differs from the first by d before both are rounded, with standard deviation
+    √2 σ. After rounding they are equal with probability E[max(0, 1 − |d|/step)].
 
     Args:
-        equal: Number of equal readings.
+        equal: Number of repeated readings that are equal to the last digit.
         count: Number of repeated readings.
         sigma: Standard deviation of one reading, [m].
         step: Step to which the dial is read, [m].
@@ -63,7 +63,10 @@ def chance_of_equal_readings(equal: int, count: int, *, sigma: float, step: floa
 
 
 def confidence_factor(dof: float, level: float = 0.95) -> float:
-    """Half width of a confidence interval, in standard deviations."""
+    """Half width of a confidence interval, in standard deviations (Student's t distribution).
+
+    It is infinite if `dof` is not positive.
+    """
     tail = 0.5 + level / 2.0
     if math.isinf(dof):
         return NormalDist().inv_cdf(tail)
@@ -73,7 +76,7 @@ def confidence_factor(dof: float, level: float = 0.95) -> float:
 def coverage_factor(dof: float) -> float:
     """Coverage factor of noise: k = 2, or Student's factor for 95 % if that is larger.
 
-    NaN if `dof` is not positive, so that the noise is unknown.
+    It is NaN if `dof` is not positive, because then the noise is unknown.
     """
     factor = confidence_factor(dof)
     return max(COVERAGE, factor) if math.isfinite(factor) else math.nan
@@ -85,7 +88,7 @@ def bounded_interval(
     """Shortest interval of a normal distribution about a value that is truncated at bounds.
 
     Its coverage is that of the expanded uncertainty with k = 2. Without bounds it is the value ±
-    that uncertainty. NaN if the uncertainty is unknown.
+    that uncertainty. It is NaN if the uncertainty is unknown.
 
     Args:
         value: Most likely value, within the bounds.
@@ -95,10 +98,12 @@ def bounded_interval(
     """
     if not 0.0 < uncertainty < math.inf:
         return value - uncertainty, value + uncertainty
+    # lengths are in √2 standard deviations, the unit of the argument of erf
     to_deviations = COVERAGE / uncertainty / math.sqrt(2.0)
     below, above = ((value - lower) * to_deviations, (upper - value) * to_deviations)
 
     def doubled_coverage(half_width: float) -> float:
+        """Twice the coverage of an interval without truncation of the distribution."""
         return math.erf(min(half_width, below)) + math.erf(min(half_width, above))
 
     required = math.erf(COVERAGE / math.sqrt(2.0)) * doubled_coverage(math.inf)

@@ -23,7 +23,7 @@ def median_of_largest(stds: Array) -> float:
     """Median of the largest absolute value of independent normal variables with mean 0.
 
     Args:
-        stds: Their standard deviations, shape (n,). Variables without any are 0.
+        stds: Their standard deviations, shape (n,); a variable with 0 is always 0.
     """
     from scipy.special import erf
 
@@ -57,11 +57,11 @@ def log_positive_share(mean: Array, covariance: Array) -> float:
 
 
 def log_positive_share_of_independent(mean: Array, std: float) -> float:
-    """Logarithm of this probability for independent variables with one standard deviation.
+    """Logarithm of the probability that independent normal variables are all positive.
 
     Args:
         mean: Their means, shape (k,).
-        std: The standard deviation.
+        std: Their common standard deviation.
     """
     from scipy.special import log_ndtr
 
@@ -70,7 +70,7 @@ def log_positive_share_of_independent(mean: Array, std: float) -> float:
 
 @cache
 def _log_lattice(dimensions: int) -> Array:
-    """Logarithms of a Kronecker sequence in the unit cube, shape (LATTICE, dimensions)."""
+    """Logarithms of the points of a folded Kronecker sequence, shape (LATTICE, dimensions)."""
     root = 2.0
     for _ in range(64):  # x = (1 + x)^(1 / (d + 1))
         root = (1.0 + root) ** (1.0 / (dimensions + 1))
@@ -102,15 +102,21 @@ def log_chi_square_tail(dof: float, value: float) -> float:
 
 
 def f_tail(dof: float, dof_below: float, value: float) -> float:
-    """Probability that an F variable exceeds a value; `dof_below` belongs to the denominator."""
+    """Probability that an F variable exceeds a value.
+
+    Args:
+        dof: Degrees of freedom of the numerator.
+        dof_below: Degrees of freedom of the denominator.
+        value: The value.
+    """
     return incomplete_beta(0.5 * dof_below, 0.5 * dof, dof_below / (dof_below + dof * value))
 
 
-def t_quantile(dof: float, share: float) -> float:
-    """Quantile of Student's t distribution."""
+def t_quantile(dof: float, probability: float) -> float:
+    """Quantile of Student's t distribution: the value with this probability below it."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(dof, share))
+    return float(stdtrit(dof, probability))
 
 
 def incomplete_beta(a: float, b: float, x: float) -> float:
@@ -121,7 +127,11 @@ def incomplete_beta(a: float, b: float, x: float) -> float:
 
 
 def least_number(exceeds: Callable[[float], bool]) -> float:
-    """Smallest positive number for which a monotonic condition is true, by bisection."""
+    """Smallest positive number for which a condition is true, to the last bit, by bisection.
+
+    Args:
+        exceeds: Condition that is true for all numbers above a limit, and false below it.
+    """
     low, high = 0.0, 1.0
     while not exceeds(high):
         low, high = high, 2.0 * high

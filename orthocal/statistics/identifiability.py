@@ -23,7 +23,7 @@ from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
 NEGLIGIBLE = 1e-9
-"""Coefficient of a combination, in prior std, below which it is a rounding error."""
+"""Coefficient of a combination, in units of prior std, below which it is a rounding error."""
 
 EQUAL_NORMS = 1e-9
 """Relative difference of the norms of two columns below which it is a rounding error."""
@@ -48,22 +48,22 @@ class Combination:
 
     def shorten(self, max_terms: int | None) -> str:
         """Formula with at most `max_terms` terms, the largest coefficients first; None for all."""
-        others = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if max_terms else self.terms[1:]
-        text = self.terms[0][0]
-        for name, coefficient in others if max_terms is None else others[: max_terms - 1]:
+        (text, _), *others = self.terms
+        omitted: list[tuple[str, float]] = []
+        if max_terms is not None:
+            others.sort(key=lambda term: -abs(term[1]))
+            others, omitted = others[: max_terms - 1], others[max_terms - 1 :]
+        for name, coefficient in others:
             size = f"{abs(coefficient):.3g}"
             factor = "" if size == "1" else f"{size} "
             text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
-        omitted = 0 if max_terms is None else len(self.terms) - max_terms
-        if omitted <= 0:
+        if not omitted:
             return text
-        return (
-            f"{text} and {omitted} more, of at most {abs(others[(max_terms or 1) - 1][1]):.2g} each"
-        )
+        return f"{text} and {len(omitted)} more, of at most {abs(omitted[0][1]):.2g} each"
 
     @property
     def words(self) -> str:
-        """Description in words, such as "a and b: only their sum"."""
+        """Description of what the readings determine, such as "a and b: only their sum"."""
         if len(self.terms) == 2 and f"{abs(self.terms[1][1]):.3g}" == "1":
             kind = "sum" if self.terms[1][1] > 0 else "difference"
             return f"{self.terms[0][0]} and {self.terms[1][0]}: only their {kind}"
@@ -95,8 +95,9 @@ class Identifiability(FileRecord):
     structural_rank: Count
     """Rank for readings without noise. If base parameters were estimated, of all parameters."""
     n_postures: Annotated[Count, Field(ge=1)]
+    """Number of postures of the session."""
     n_readings: Count
-    """Independent readings: readings minus repetitions and gauge zeros."""
+    """Number of independent readings: readings minus repetitions and gauge zeros."""
     n_nuisance: Size
     """Effective number of nuisance parameters, with their priors: independent readings that
     determine them instead of errors of the machine."""
@@ -105,7 +106,8 @@ class Identifiability(FileRecord):
     resolvable: Many[str]
     """Parameters whose standard deviation from the readings alone is below the prior one."""
     alike: Many[Recorded]
-    """Groups of parameters with proportional effects, of which only a sum is resolvable."""
+    """Groups of parameters with proportional effects on the readings, which determine only a sum of
+    each group."""
     base: Many[Recorded]
     """Base parameters by QR decomposition with pivoting."""
 

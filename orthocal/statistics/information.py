@@ -20,6 +20,9 @@ from orthocal.text import list_some
 RANK_THRESHOLD = 1e-10
 """Ratio to the largest singular value below which others count as zero."""
 
+NULL_COMPONENT = 1e-6
+"""Component of a parameter in the null space below which it is a rounding error."""
+
 VAGUE = 1e-8
 """Inverse variance that replaces a missing prior, [1 per prior std²]."""
 
@@ -33,7 +36,7 @@ _list = partial(list_some, most=MAX_LISTED)
 
 
 def square_root(covariance: Array) -> Array:
-    """Matrices R with R Rᵀ equal to covariances, which may be singular, shape (..., n, n)."""
+    """Square roots R of covariances C = R Rᵀ, which may be singular, shape (..., n, n)."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
@@ -42,11 +45,11 @@ class Information:
     """Identification Jacobian with gauge zeros eliminated, and its singular value decomposition.
 
     Args:
-        factor: The Jacobian, or another matrix with the same product FᵀF, shape (n, n_free),
+        factor: The Jacobian, or another matrix F with the same product FᵀF, shape (n, n_free),
             [m per prior std].
 
     Attributes:
-        factor: Matrix with the same product FᵀF and at most 2 n_free rows.
+        factor: Matrix F with the same product FᵀF and at most 2 n_free rows.
     """
 
     def __init__(self, factor: Array) -> None:
@@ -80,7 +83,7 @@ class Information:
     def identifiable(self) -> Mask:
         """Mask of the parameters that the readings alone determine, shape (n_free,)."""
         null = self.directions[self.rank :]
-        return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
+        return np.asarray(np.sqrt((null**2).sum(axis=0)) < NULL_COMPONENT)
 
     def determined(self, *, sigma: float) -> Mask:
         """Mask of the parameters whose standard deviation from the readings is below the prior one.
@@ -262,7 +265,7 @@ def require_identifiable(
     stacked = np.vstack([information.factor / largest, np.diag(precision)])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)
     null = directions[values <= RANK_THRESHOLD * values[0], : len(names)]
-    undetermined = tuple(compress(names, (null**2).sum(axis=0) > 1e-12))
+    undetermined = tuple(compress(names, (null**2).sum(axis=0) > NULL_COMPONENT**2))
     if undetermined:
         information = assume_others_known(information, len(names))
         advice = _advise(information, names, null)
@@ -295,8 +298,9 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
     null_rows = _reduce(null[:, ~without_effect])
     other_names = list(compress(names, ~without_effect))
     for row in null_rows[:MAX_DIRECTIONS]:
+        # rounded, so that rounding errors do not decide the order of equal components
         order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
-        terms = [i for i in order if abs(row[i]) > 1e-6]
+        terms = [i for i in order if abs(row[i]) > NULL_COMPONENT]
         changes = [
             f"{other_names[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}" for i in terms
         ]
@@ -307,7 +311,7 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
 def _reduce(rows: Array) -> Array:
     """Reduced echelon form of the space that is spanned by rows.
 
-    The pivots are the columns with the largest norms; the first of equal ones.
+    The pivots are the columns with the largest norms; of equal ones the first.
     """
     _, values, basis = np.linalg.svd(rows, full_matrices=False)
     basis = basis[values > 1e-6]

@@ -27,9 +27,10 @@ MIN_DOF = 0.5
 """Degrees of freedom below which residuals do not determine the noise."""
 
 NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
+"""Source of the noise: scatter of repeated cycles, residuals, or the stated value of the gauge."""
 
 _SOURCES: tuple[NoiseSource, ...] = ("residuals", "cycles", "gauge", "unknown")
-"""Sources; for several gauges the first of them counts."""
+"""Sources in their order of precedence: the noise of several gauges has the first of theirs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,12 +42,15 @@ class Noise(FileRecord):
     dof: SizeOrInf
     """Degrees of freedom; infinite for a stated sigma."""
     source: NoiseSource
+    """Source of `sigma`."""
     cycles_sigma: SizeOrNaN
     """Standard deviation from repeated cycles, [m]; NaN without cycles."""
     cycles_dof: Count
+    """Degrees of freedom of `cycles_sigma`; 0 without cycles."""
     residual_sigma: SizeOrNaN
     """Standard deviation from residuals, √(Σ r²/dof), [m]; NaN without degrees of freedom."""
     residual_dof: Size
+    """Degrees of freedom of the residuals."""
 
     def without_residuals(
         self, gauge: float | None, resolution: float | None
@@ -66,7 +70,7 @@ class Noise(FileRecord):
         return floor, math.inf
 
     def scaled(self, factor: float) -> Noise:
-        """Noise in another unit; `factor` is the size of the present one."""
+        """Noise with all standard deviations multiplied by a factor."""
         return replace(
             self,
             sigma=self.sigma * factor,
@@ -79,7 +83,10 @@ class Noise(FileRecord):
         return self if math.isnan(self.sigma) else replace(self, sigma=sigma)
 
     def at_least(self, floor: float) -> Noise:
-        """The noise, or the stated one of a gauge if that is larger, [m]."""
+        """This noise, or that of a gauge with the standard deviation `floor`, [m], if it is larger.
+
+        An unknown noise, NaN, remains unknown.
+        """
         if not self.sigma < floor:
             return self
         return replace(self, sigma=floor, dof=math.inf, source="gauge")
@@ -92,7 +99,7 @@ class Noise(FileRecord):
                 if not stated.
 
         Returns:
-            None if the noise is known from the residuals only.
+            Result of the test; None if the noise is known from the residuals only.
         """
         if self.source in ("cycles", "gauge"):
             return False
@@ -109,7 +116,8 @@ class Noise(FileRecord):
             gauge: Stated standard deviation of a reading, [m]; None if not stated.
 
         Returns:
-            None if it is not stated, or if the residuals have no degrees of freedom.
+            Result of the test; None if the noise is not stated, or if the residuals have no degrees
+            of freedom.
         """
         if gauge is None or not self.residual_dof > 0.0 or math.isnan(self.residual_sigma):
             return None
@@ -122,13 +130,16 @@ class Noise(FileRecord):
             sigma: Standard deviation of rounding, [m].
             dof: Degrees of freedom of the residuals without repetitions, which may have the same
                 rounding error.
+
+        Returns:
+            Result of the test; None without sufficient degrees of freedom.
         """
         if dof < 1.0 or not self.residual_dof > MIN_DOF or math.isnan(self.residual_sigma):
             return None
         return chance_of_excess(dof * (self.residual_sigma / sigma) ** 2, dof) >= 1.0 - BY_CHANCE
 
     def _chance_of_residuals(self, sigma: float) -> float:
-        """Probability of residuals at least as large for a standard deviation of a reading, [m]."""
+        """Probability of residuals at least as large from a noise `sigma` of the readings, [m]."""
         chi_square = (self.residual_sigma / sigma) ** 2 * self.residual_dof
         return chance_of_excess(chi_square, self.residual_dof)
 
@@ -155,7 +166,7 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
         )
         if at_place.max() + 1 == len(entries):
             continue
-        # the more numerous ones are eliminated by their means, which takes less time
+        # the more numerous of places and zeros are eliminated by their means, which is faster
         few, many = sorted((at_zero, at_place), key=np.max)
         centred = np.column_stack([values[entries], np.eye(few.max() + 1)[few]])
         means = np.zeros((many.max() + 1, centred.shape[1]))
@@ -183,7 +194,7 @@ def estimate_noise(
     replace the stated noise, which is always a lower limit (`noise_floor`).
 
     Args:
-        repeatability: From `estimate_repeatability`.
+        repeatability: Result of `estimate_repeatability`.
         residual_square: Σ r² of single readings with gauge zeros eliminated, [m²].
         residual_dof: Readings minus gauge zeros minus effective parameters.
         gauge_sigma: Stated standard deviation of a reading, [m]; None if not stated.
@@ -228,7 +239,7 @@ def combine_noises(noises: Sequence[Noise], pooled: Noise, *, sigma: float) -> N
 
     Args:
         noises: Noise of each gauge.
-        pooled: Noise of all readings relative to `sigma` of their gauges, times that of the first.
+        pooled: Noise of all readings after scaling each to the noise of the first gauge.
         sigma: Standard deviation of a reading of the first gauge, [m].
     """
     source = min((n.source for n in noises), key=_SOURCES.index)

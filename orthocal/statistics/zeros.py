@@ -45,16 +45,18 @@ def zero_shares(observations: Observations) -> Array:
 
 
 def eliminate_zero(weights: Array) -> tuple[Array, Array, float]:
-    """Inverse covariance W of readings with one free zero, P = W − W 1 1ᵀ W / (1ᵀ W 1).
+    """Weights of readings after the elimination of their common free zero.
 
-    A zero with a large prior variance gives the same, but its rounding errors are large.
+        P = W − W 1 1ᵀ W / (1ᵀ W 1)
+
+    A zero with a large prior variance gives the same, but with large rounding errors.
 
     Args:
-        weights: W, shape (k, k).
+        weights: Inverse covariance W of the readings, shape (k, k), [1/m²].
 
     Returns:
-        P, shape (k, k); the weights W 1 / (1ᵀ W 1) of the readings in the zero, shape (k,); and
-        the variance of the zero, 1 / (1ᵀ W 1).
+        P, shape (k, k), [1/m²]; the weights W 1 / (1ᵀ W 1) of the readings in the zero, shape (k,);
+        and the variance of the zero, 1 / (1ᵀ W 1), [m²].
     """
     sums = weights.sum(axis=1)
     variance = 1.0 / float(sums.sum())

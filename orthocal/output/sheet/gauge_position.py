@@ -80,7 +80,7 @@ class GaugePosition:
         """Distance of a stated section from the rod's hinge at the drive, in the mechanical zero,
         [m]."""
         if self.rod is not None and isinstance(setup.sensor, LegIndicator):
-            self.zero_distance = setup.sensor.share_at_zero(robot, self.rod) * self.rod.length
+            self.zero_distance = setup.sensor.fraction_at_zero(robot, self.rod) * self.rod.length
         self.coordinates, self.origin_name = guidance.contact_point(setup.name)
         """Point of contact in the alignment posture, shape (3,), [m], from an origin: the tool
         centre point in the alignment posture."""
