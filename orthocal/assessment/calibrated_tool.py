@@ -14,8 +14,12 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import APPROACH, UseConditions, UseSamples, sample_use
-from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
-from orthocal.kinematics.reachable_box import find_workspace, require_travel
+from orthocal.kinematics.loop_closure import (
+    LoopClosure,
+    nominal_closure,
+    require_within_travel,
+)
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
 
@@ -145,7 +149,7 @@ def find_tool(calibration: Calibration, use: UseSamples | None = None) -> Calibr
     def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         for offsets in (calibration.active_offsets, identified_offsets):
-            require_travel(robot, drives - offsets)
+            require_within_travel(robot, drives - offsets)
             closure.forward(drives - offsets, start=passive)
 
     try:

@@ -24,7 +24,7 @@ ARROWS = {1.0: "↑", -1.0: "↓", 0.0: "·"}
 """Arrows by the direction in which the displayed number of a joint moves."""
 
 UseCondition = Literal["approach", "temperature", "payload"]
-"""Field of `UseConditions`."""
+"""Name of a field of `UseConditions`."""
 
 CONDITION_OF: Mapping[UseCondition, Condition] = {
     "approach": "approach",
@@ -83,7 +83,7 @@ class UseConditions:
                 )
 
     def values(self, robot: Robot) -> dict[Condition, Array]:
-        """Values of the conditions; neutral where not stated, and for the load."""
+        """Values of the conditions, neutral where not stated. The load is always neutral."""
         result: dict[Condition, Array] = {
             c: np.full(condition_size(robot, c), v) for c, v in neutral_values(robot).items()
         }
@@ -105,7 +105,7 @@ class UseSamples:
 
     conditions: tuple[UseConditions, ...]
     varying: tuple[UseCondition, ...] = ()
-    """Fields of the conditions that vary; `approach` once for each drive with two sides."""
+    """Names of the fields that vary; `approach` once for each drive with two sides."""
     signs: Array = field(default_factory=lambda: np.zeros((1, 0)))
     """Lower (-1) or upper (1) value of each varying condition, shape (n_samples, n_varying)."""
     declared: Use | None = None
@@ -149,6 +149,7 @@ def sample_use(robot: Robot, conditions: UseConditions | None = None) -> UseSamp
         if name in used and low < high:
             varying.append(name)
             widths[name] = (high - low) / np.sqrt(12.0)
+    # Hadamard matrix (Sylvester): the smallest with as many columns beside the constant first one
     size = 1 << len(varying).bit_length() if varying else 1
     columns = range(1, len(varying) + 1)
     parity = [[(i & j).bit_count() % 2 for j in columns] for i in range(size)]
@@ -179,7 +180,7 @@ def _narrow(use: Use, conditions: UseConditions | None) -> Use:
 
 
 def effects_by_condition(robot: Robot) -> dict[UseCondition, tuple[str, ...]]:
-    """Fields of `UseConditions` on which a machine depends, mapped to the effects concerned."""
+    """Fields of `UseConditions` on which a machine depends, mapped to the names of the effects."""
     conditions, effects = error_map(robot).conditions, robot_effects(robot)
     return {
         name: tuple(effect.name for effect in effects if c in effect.conditions)
@@ -214,7 +215,7 @@ def stated_use(robot: Robot, use: Use | None = None) -> StatedUse | None:
 
 
 def find_approach_problem(text: str, robot: Robot) -> str:
-    """Text and expectation if an approach is not one letter per drive; else ""."""
+    """Message about an approach that is not one letter per drive; "" for a valid one."""
     text = text if isinstance(text, str) else repr(text)
     if len(text) == len(robot.drives) and not text.strip("".join(APPROACH)):
         return ""

@@ -30,29 +30,38 @@ from orthocal.text import percent
 from orthocal.units import DRIVE_UNITS
 
 Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
+"""Type of `System.evaluate`."""
+
 Prepare = Callable[[Array, MachineGeometry], Array]
+"""Type of `System.prepare`."""
+
 Failures = dict[int, ClosureError]
 """Indices of postures, mapped to the reason why they cannot be reached. Posture k of machine s has
 the index s K + k if each machine has K postures."""
 
 SINGULAR_BELOW = 1e-5
-"""Ratio of smallest to largest singular value below which a posture counts as singular. Near a
-singular posture the residual is quadratic in the distance, and Newton's method stops below
-CLOSURE_TOLERANCE: smaller ratios would not be noticed. The Orthoglide has 1/20 to 1/60."""
+"""Ratio of smallest to largest singular value below which a posture counts as singular. Smaller
+ratios would not be noticed: near a singular posture the residual is quadratic in the distance, and
+Newton's method stops below CLOSURE_TOLERANCE. The ratios of the Orthoglide are 1/20 to 1/60."""
 
 SINGULAR_MARGIN = 0.1
 """Factor of SINGULAR_BELOW that allows for rounding errors of an inverse."""
 
 MAX_NEWTON_STEP = 1e3
-"""Longer Newton steps are caused by linearly dependent rows, [m or rad]."""
+"""Largest component of a Newton step, [m, rad]; linearly dependent rows cause larger ones."""
 
 MAX_LAST_STEP = 1e-6
-"""Longer steps from closed loops are caused by nearly singular postures, [m or rad]."""
+"""Largest component of a step from closed loops, [m, rad]; nearly singular postures cause larger
+ones."""
 
 MAX_NEWTON_STEPS = 30
+"""Largest number of Newton steps for one waypoint."""
+
 MAX_STEP_REDUCTIONS = 3
+"""Number of lengths of a Newton step that are tried; each is a quarter of the one before."""
+
 UNTESTED_STEPS = 4
-"""Newton steps without a test of `MAX_REMAINING`."""
+"""Number of first Newton steps to which `MAX_REMAINING` does not apply."""
 
 MAX_REMAINING = 0.5
 """Largest residual after a Newton step, relative to that before. Beyond it a posture is abandoned:
@@ -60,11 +69,15 @@ it is out of reach, or it is approached in shorter steps. Near a singular postur
 """
 
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
+"""Smallest continuation step, as a fraction of the path."""
+
 LARGEST_CONTINUATION_MOVE = 0.3
-"""Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
+"""Largest change of a passive coordinate in one continuation step, [rad] or characteristic
+lengths."""
 
 MAX_POINTS = 4096
-"""Postures per block of a batch of machines, which limits the memory of their Jacobians."""
+"""Largest number of postures of all machines that are solved at once, to limit the memory of their
+Jacobians."""
 
 
 class System:
@@ -149,10 +162,10 @@ class System:
         the inverse anyway.
         """
         try:
-            if self.shortest:
-                raise np.linalg.LinAlgError
-            inverses = np.linalg.inv(jacobians)
+            inverses = None if self.shortest else np.linalg.inv(jacobians)
         except np.linalg.LinAlgError:
+            inverses = None
+        if inverses is None:
             return self.step(residuals, jacobians), np.zeros(len(residuals), dtype=np.bool_)
         norms = np.linalg.norm(self.scaled(jacobians), axis=(1, 2))
         scaled_inverses = inverses * (self.units[:, None] / self.row_units)
@@ -208,7 +221,7 @@ def solve_closures(
     Raises:
         ClosureError: If a posture cannot be reached or is outside the limits of a joint, or if it
             is singular and this is not allowed; states the posture and the residual.
-        ValueError: If the start values have another shape.
+        ValueError: If start values or names have another number than expected.
     """
     count = len(targets)
     labels = label_postures(names, count)
@@ -235,7 +248,7 @@ def solve_closures(
 
 
 def label_postures(names: Sequence[str] | None, count: int) -> Sequence[str]:
-    """Names of postures for messages; by default their numbers.
+    """Names of postures for messages; by default numbered from 1, such as "posture 1".
 
     Raises:
         ValueError: If there are more or fewer names than postures.
@@ -293,7 +306,7 @@ class _Path:
         self._refused[i] = True
 
     def follow(self, start: Array, *, restart: bool) -> Array:
-        """Solutions, NaN at refused points, shape (n, n_x).
+        """Solve the equations at all targets: x, NaN at refused points, shape (n, n_x).
 
         Args:
             start: Start values of x, shape (n, n_x).
@@ -302,6 +315,7 @@ class _Path:
         system, targets, count = self._system, self._targets, len(self._targets)
         for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
             self._refuse(i, "has coordinates that are not numbers")
+        # regular: known not to be singular, or not to be checked
         x, regular = np.array(start), np.full(count, self._allow_singular)
         done, step = np.zeros(count), np.ones(count)  # fractions of the path
         pending, may_restart = np.flatnonzero(~self._refused), np.full(count, restart)

@@ -44,8 +44,7 @@ from orthocal.robot.frames import Placement
 from orthocal.robot.model import Robot
 
 PLACEMENTS_CACHE_SIZE = 16
-"""Machines whose placements are cached: steps of a solver, loop closures and readings share them.
-"""
+"""Number of machines whose placements are cached, for solvers, loop closures and readings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +55,7 @@ class MachineGeometry:
     """
 
     map: ErrorMap
+    """Error map of the robot."""
     placements: Array
     """Moved placements, shape (..., 12 n_moved), [1, m]."""
     drive_errors: Array
@@ -86,7 +86,12 @@ class MachineGeometry:
         return by_commands, by_errors
 
     def at(self, points: NDArray[np.intp], count: int) -> MachineGeometry:
-        """Geometry of some of `count` points: one row per point, or one row for all."""
+        """Geometry of some of `count` points: one row per point, or one row for all.
+
+        Args:
+            points: Indices of the points, shape (n,).
+            count: Number of all points, a multiple of the number of rows.
+        """
 
         def choose(values: Array) -> Array:
             rows = values.reshape(-1, values.shape[-1])
@@ -203,7 +208,12 @@ class ErrorMap:
         return self.robot.parameters.coefficients(self.names, names)
 
     def command(self, coordinates: Array) -> Array:
-        """Commands of drive coordinates, shape (..., n_command); commands are unchanged."""
+        """Commands of drive coordinates under neutral conditions, shape (..., n_command).
+
+        Args:
+            coordinates: Drive coordinates, shape (..., n_drives), or commands, which are returned
+                unchanged.
+        """
         missing = len(self.robot.drives) + self._neutral.size - coordinates.shape[-1]
         if not missing:
             return coordinates
@@ -419,9 +429,9 @@ class ErrorMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VaryingDerivatives:
-    """Derivatives ∂ξ = T ∂δ of the placements that vary, of S machines under V conditions.
+    """Derivatives ∂ξ = T ∂δ of the placements that vary, for S machines under V conditions.
 
-    ∂δ is `constant`, plus `by_errors` @ `unit_errors` in some rows.
+    ∂δ is `constant`, plus `by_errors` @ `unit_errors` in the rows `rows`.
     """
 
     right: Array
@@ -454,6 +464,7 @@ class _Twists:
         self._of_twist, self._of_error = of_twist, of_error  # twist and error of each nonzero
         nonzeros = [jacobian.nz[k] for k in range(of_twist.size)]
         constant = np.array([v.is_constant() for v in nonzeros], dtype=np.bool_)
+        # at most one linear error per component, so that terms can be assigned by index
         first = np.isin(np.arange(of_twist.size), np.unique(of_twist, return_index=True)[1])
         self._general_errors = np.unique(of_error[~(constant & first)])
         linear = ~np.isin(of_error, self._general_errors)
@@ -474,6 +485,7 @@ class _Twists:
         )
 
     def __call__(self, errors: Array, conditions: Array) -> Array:
+        """Twists δ, shape (..., 6 n_moved): `ErrorMap.twists_of`."""
         result = np.zeros((*errors.shape[:-1], self._n))
         result[..., self._linear_twists] = self._slopes * errors[..., self._linear_errors]
         if self.general.size:

@@ -25,28 +25,29 @@ from orthocal.runtime import disk_cache
 Result = TypeVar("Result")
 
 MAX_FUNCTIONS = 256
-"""Functions held in memory; one needs up to 2 MB."""
+"""Largest number of functions in memory; one needs up to 2 MB."""
 
 MAX_ROBOTS = 8
-"""Robots whose results of a function are held in memory."""
+"""Largest number of robots for which the results of a function are in memory."""
 
 OPTIONS = {"cse": True}
-"""CasADi options of large functions: common subexpressions are computed once."""
+"""CasADi options of large functions: compute common subexpressions once."""
 
 _CODE_DIRECTORIES = (
     "kinematics",
+    "kinematics/backend",
     "sensors",
     "robot",
     "effects",
     "estimation",
     "estimation/solvers",
 )
-"""Directories of orthocal with code that builds functions."""
+"""Directories of orthocal with code that builds functions or lists their instructions."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Recipe:
-    """Key and constructor of a function; recipes with the same key are equal."""
+    """Key of a function and a callable that builds it; recipes with the same key are equal."""
 
     key: str
     build: Callable[[], ca.Function] = field(compare=False)
@@ -111,7 +112,7 @@ class _RobotKey:
 
 
 def cached_per_robot(function: Callable[[Robot], Result]) -> Callable[[Robot], Result]:
-    """Decorator that caches a function of a robot; robots of equal identity share the result."""
+    """Cache the results of a function of a robot; robots of equal identity share a result."""
     cached = lru_cache(MAX_ROBOTS)(lambda key: function(key.robot))
 
     @wraps(function)

@@ -1,7 +1,8 @@
 """Solver of the loop closures g(q, θ) = 0, for batches of machines and postures.
 
-Forward: passive coordinates and tool centre point of commanded drives. Inverse: drives that bring
-the tool centre point to a position. `continuation` solves the equations.
+The forward problem has the passive coordinates q and the tool centre point of commanded drive
+coordinates as its solution. The inverse problem has the drive coordinates that bring the tool
+centre point to a position. `continuation` solves the equations.
 """
 
 from __future__ import annotations
@@ -31,16 +32,17 @@ from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot, require_commanded_tool, require_tcp
 
 FORCE_CACHE_SIZE = 32
-"""Sets of postures whose rod forces are cached for one robot."""
+"""Number of sets of postures whose rod forces are cached for one robot."""
 
 SOLUTION_CACHE_SIZE, MAX_CACHED_POSTURES = 32, 200
-"""Sets of postures whose solutions are cached, and postures per set."""
+"""Number of sets of postures whose solutions are cached, and most postures in such a set."""
 
 MAX_ITERATIONS = 10
+"""Largest number of fixed-point iterations of `LoopClosure.reach`. Each reduces the change of the
+conditions by more than a factor of 100."""
+
 CONDITION_TOLERANCE = 1e-9
-"""Relative change at which the conditions of an inverse have converged: loads, and coordinates on
-which placements depend, which follow from the drive coordinates of the inverse. Each iteration
-reduces their change by more than a factor of 100."""
+"""Relative change at which conditions that follow from drive coordinates have converged."""
 
 
 class LoopClosure:
@@ -56,7 +58,15 @@ class LoopClosure:
         free: Names of the parameters whose values are passed to each call as `theta`, in order.
         fixed: Values of other parameters, [unit of the parameter]; 0 where absent.
         conditions: Conditions of use for drive coordinates without conditions. The default is
-            neutral: middle of both sides of each drive, reference temperature, no weight.
+            neutral: middle of both sides of each drive, reference temperature, no payload.
+
+    Attributes:
+        robot: The argument `robot`.
+        free: Names of the free parameters.
+        fixed: Values of the parameters that are not free, [unit of the parameter].
+
+    Raises:
+        ParameterError: If the name of a parameter is unknown.
     """
 
     def __init__(
@@ -74,7 +84,6 @@ class LoopClosure:
         self._functions = robot_functions(robot)
         self._unit_errors = self._functions.errors.unit_errors(self.free)
         self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
-        """Values of the parameters that are not free."""
         self._fixed = self._functions.errors.expand(self.fixed)
         self._solutions = _solutions(robot)
 
@@ -99,8 +108,8 @@ class LoopClosure:
             start: Start values of the passive coordinates, shape (n_passive,), (K, n_passive) or
                 (S, K, n_passive); the reference posture by default.
             names: Names of the postures, for messages.
-            allow_free: Accept free passive motions, such as those of a robot that is only
-                displayed; the passive coordinates then move as little as possible.
+            allow_free: True to accept free passive motions, such as those of a robot that is only
+                displayed. The passive coordinates then move as little as possible.
             failures: Filled with the postures that cannot be reached, whose results are NaN; by
                 default the first of them raises.
 
@@ -130,8 +139,8 @@ class LoopClosure:
 
         is_one_machine = values.ndim == 1 and (start is None or np.ndim(start) <= 2)
         if is_one_machine and len(d) <= MAX_CACHED_POSTURES and failures is None and not allow_free:
-            begin = None if start is None else np.asarray(start).tobytes()
-            passive = self._solutions.find((values.tobytes(), d.tobytes(), begin), solve)
+            start_key = None if start is None else np.asarray(start).tobytes()
+            passive = self._solutions.find((values.tobytes(), d.tobytes(), start_key), solve)
         else:
             passive = solve()
         return passive[..., 0, :] if single else passive
@@ -177,8 +186,8 @@ class LoopClosure:
 
         Args:
             points: Commanded coordinates of the tool, shape (K, n_drives) or (n_drives,), [m]; or
-                positions as `forward` returns them, shape (K, 3) or (3,), of which the others are
-                ignored.
+                positions as `forward` returns them, shape (K, 3) or (3,). Coordinates that are not
+                commanded are ignored.
             names: Names of the postures, for messages.
             failures: Filled with the points that cannot be reached; by default the first raises.
 
@@ -237,7 +246,8 @@ class LoopClosure:
             before, commands = commands[:, n:], self.commands(x[:, :n])
             change = np.abs(commands[:, n:] - before)
             scale = np.nan_to_num(np.abs(before)).max(axis=0, initial=0.0)
-            changing = (change > CONDITION_TOLERANCE * scale).any(axis=1)  # False at refused points
+            # False at refused points, whose coordinates are NaN
+            changing = (change > CONDITION_TOLERANCE * scale).any(axis=1)
             if not changing.any():
                 break
             start = np.where(np.isfinite(x), x, self._inverting.start)
@@ -261,7 +271,7 @@ class LoopClosure:
         names: Sequence[str] | None,
         failures: Failures | None,
     ) -> Array:
-        """Joint coordinates of `reach` under the conditions of some drive coordinates."""
+        """Joint coordinates of `reach` under the conditions of stated drive coordinates."""
         commands = self.commands(drives)
         targets = np.hstack([points, commands[:, len(self.robot.drives) :]])
 
@@ -302,8 +312,8 @@ class LoopClosure:
             Shape (K, 3) or (3,), [m]; a batch has S in front.
 
         Raises:
-            RobotError: If the robot has no tool.
-            ValueError: If drive and passive coordinates do not fit each other.
+            RobotError: If the robot has no tool centre point.
+            ValueError: If the passive coordinates do not have this shape.
         """
         frame = require_tcp(self.robot).frame
         d, single = self._as_commands(drives)
@@ -467,7 +477,7 @@ class LoopClosure:
 
 @cached_per_robot
 def _solutions(robot: Robot) -> ArrayCache:
-    """Solutions of a robot's closures, which several models and figures of a session need."""
+    """Cache of solutions of a robot's closures, which several models of a session share."""
     return ArrayCache(SOLUTION_CACHE_SIZE)
 
 
@@ -529,11 +539,11 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> Failures:
-    """Rows of drive coordinates beyond the travel of a drive in their order, with the reason.
+    """Indices of the postures beyond the travel of a drive, in ascending order, with the reason.
 
     Args:
         robot: The robot.
-        drives: Shape (K, n_drives), [m, rad].
+        drives: Drive coordinates, shape (K, n_drives), [m, rad].
         names: Names of the postures, for messages; by default their numbers.
     """
     failures, labels = Failures(), label_postures(names, len(drives))
@@ -541,7 +551,7 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
         size = drive.joint_size
         for i in np.flatnonzero(drive.is_beyond(values)).tolist():
             reason = (
-                f"{drive.name}_{drive.joint_unit} is {values[i] / size:g}; the drive reaches from "
+                f"has {drive.name}_{drive.joint_unit} {values[i] / size:g}; the drive reaches from "
                 f"{drive.lower / size:g} to {drive.upper / size:g}"
             )
             failures.setdefault(i, ClosureError(reason, posture=labels[i]))
@@ -549,7 +559,7 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
 
 
 def require_within_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> None:
-    """Refuse drive coordinates beyond the travel of a drive.
+    """Refuse drive coordinates beyond the travel of a drive; arguments of `find_beyond_travel`.
 
     Args:
         robot: The robot.
@@ -557,7 +567,7 @@ def require_within_travel(robot: Robot, drives: Array, names: Sequence[str] | No
         names: Names of the rows, for messages.
 
     Raises:
-        ClosureError: Of `find_beyond_travel`, for the first such row.
+        ClosureError: If a posture is beyond the travel; names the first one, and the drive.
     """
     for failure in find_beyond_travel(robot, drives, names).values():
         raise failure

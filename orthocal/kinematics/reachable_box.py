@@ -12,7 +12,7 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot, fingerprint, function_key
-from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.loop_closure import nominal_closure, require_within_travel
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
     POINTS_PER_SIDE,
@@ -38,11 +38,11 @@ REACH_MARGIN = 1.08
 """Factor by which the nominal machine must reach further than the default cube."""
 
 MAX_CONDITION_NUMBER = 10.0
-"""Largest condition number in a workspace of the tool Jacobian with respect to the drives, whose
-rotations are scaled to metres."""
+"""Largest condition number, in a workspace, of the derivative of the tool position with respect to
+the drives. Rotations of drives are scaled to metres."""
 
 BISECTION_TOLERANCE = 0.004
-"""Relative accuracy of the bisection for the largest box."""
+"""Relative difference of the limits at which the bisection for the largest box ends."""
 
 
 def find_workspace(robot: Robot, require_reach: RequireReach | None = None) -> Workspace:
@@ -100,14 +100,14 @@ def _default_workspace(robot: Robot) -> Workspace:
 
 
 def describe_unreachable_box(robot: Robot, box: Array) -> str:
-    """Reason why the nominal machine does not reach a box, and the largest similar box.
+    """Message that the nominal machine does not reach a box, with the largest similar box.
 
     Args:
         robot: The robot.
         box: Limits relative to the mechanical zero, shape (n_coordinates, 2), [m].
 
     Returns:
-        "" if it reaches the box.
+        The message; "" if the machine reaches the box.
     """
     require_reach, letters = _nominal_reach_check(robot), coordinate_letters(robot)
     try:
@@ -136,27 +136,16 @@ def _nominal_reach_check(robot: Robot) -> RequireReach:
         for failure in find_below_bed(robot, points).values():
             raise failure
         drives, passive = nominal_closure(robot).reach(points)
-        require_travel(robot, drives)
+        require_within_travel(robot, drives, ["a corner"] * len(drives))
         singular = ClosureError("is nearly singular", posture="a corner")
         try:
             jacobians = sensitivity(drives, passive=passive)[:, coordinates] / units
-        except np.linalg.LinAlgError:  # of the closures: the drives leave motions free
+        except np.linalg.LinAlgError:  # the closures are singular: the drives leave motions free
             raise singular from None
         if (np.linalg.cond(jacobians) > MAX_CONDITION_NUMBER).any():
             raise singular
 
     return require_reach
-
-
-def require_travel(robot: Robot, drives: Array) -> None:
-    """Refuse drive coordinates beyond the travel of a drive, shape (K, n_drives), [m, rad].
-
-    Raises:
-        ClosureError: Naming the drive.
-    """
-    for drive, values in zip(robot.drives, drives.T, strict=True):
-        if drive.is_beyond(values).any():
-            raise ClosureError(f"is beyond the travel of {drive.name}", posture="a corner")
 
 
 def _largest_box(robot: Robot, box: Array, require_reach: RequireReach) -> Workspace:
@@ -205,4 +194,5 @@ def no_workspace_error() -> ClosureError:
 def _round_down(length: float) -> float:
     """Length rounded down to whole millimetres, or to tenths below ten, [m]."""
     step = 1e-3 if length >= 10e-3 else 1e-4
+    # 1e-9: a multiple of the step is not rounded down by a rounding error
     return round(math.floor(length / step + 1e-9) * step, 6)

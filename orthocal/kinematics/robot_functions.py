@@ -47,7 +47,7 @@ class _MotionSource:
     joint: int | None
     """Index of the joint; None if only an error acts."""
     first: int | None
-    """Index of the first of its six twist components; None if no error acts."""
+    """Index of the first of the six twist components of the error; None if no error acts."""
 
 
 class RobotFunctions:
@@ -57,7 +57,8 @@ class RobotFunctions:
         robot: The nominal robot.
         passive: Values of the passive coordinates; symbols by default.
         placements: Symbols of the placements, shared with other functions; new ones by default.
-        reference: Use the placements in the reference posture if they depend on drive coordinates.
+        reference: True to use the placements in the reference posture where they depend on drive
+            coordinates.
 
     Attributes:
         actuated: Symbol of the actual drive coordinates, shape (n_drives,), [m, rad].
@@ -148,19 +149,27 @@ class RobotFunctions:
         return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()
 
     def fixed_frames(self, frames: Sequence[int]) -> str:
-        """Placements of those of some frames that have no error, in words."""
+        """Text of the placements of those frames that have no error, for digests.
+
+        Args:
+            frames: Indices of frames.
+        """
         moved = moved_frames(self.errors.moved)
         return self._fixed([Placement(f, True) for f in frames if f not in moved])
 
     def fixed_passive(self, frames: Sequence[int]) -> str:
-        """Reference values of the passive coordinates that move some frames, in words."""
+        """Text of the reference values of the passive coordinates that move frames, for digests.
+
+        Args:
+            frames: Indices of frames.
+        """
         joints = self.robot.model.joints
         moving = {joints[j].idx_v for f in frames for j in self.tree.joints_to(f)}
         coordinates = zip(self.robot.passive_index, self.robot.reference_passive, strict=True)
         return repr([(int(k), float(value)) for k, value in coordinates if k in moving])
 
     def _fixed(self, placements: Sequence[Placement]) -> str:
-        """Values of placements without errors, in words."""
+        """Text of the values of placements without errors."""
         model, moved = self.robot.model, moved_frames(self.errors.moved)
         values = (nominal_placement(model, p, moved).homogeneous.tolist() for p in placements)
         return repr(list(zip(placements, values, strict=True)))

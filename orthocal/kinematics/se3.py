@@ -1,6 +1,6 @@
 """Exponential of SE(3) and its Jacobian, for NumPy arrays and CasADi expressions.
 
-The logarithm and its Jacobian are for expressions only.
+The logarithm and its Jacobian exist for expressions only.
 
 A twist is (translation v, rotation ω), as in Pinocchio. All coefficients belong to one family,
 
@@ -36,15 +36,17 @@ _INVERSE_FACTORIALS = tuple(1.0 / math.factorial(n) for n in range(5 + 2 * SERIE
 """1/n!, for the series of five coefficients."""
 
 LOGARITHM_SERIES_ABOVE = 0.995
-"""Cosine above which the coefficients of the logarithm come from their series: their first omitted
-terms are below 1e-15 of them there."""
+"""Cosine above which the coefficients of the logarithm come from their series, whose relative error
+is below 1e-15 there."""
 
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
-"""Series of θ/sin θ in sin² θ."""
+"""Coefficients of the series of θ/sin θ in sin² θ."""
+
 _BERNOULLI = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-"""Series of 1/θ² − (1 + cos θ)/(2 θ sin θ) in θ²."""
+"""Coefficients of the series of β = 1/θ² − (1 + cos θ)/(2 θ sin θ) in θ²."""
+
 _BERNOULLI_SLOPE = tuple(2.0 * k * c for k, c in enumerate(_BERNOULLI))[1:]
-"""Series of the derivative of this by θ, divided by θ, in θ²."""
+"""Coefficients of the series of (dβ/dθ)/θ in θ²."""
 
 
 class _Operations(NamedTuple):
@@ -211,7 +213,7 @@ def _series(square: Operand, first: int) -> Operand:
 
 def _polynomial(x: Operand, coefficients: tuple[float, ...]) -> Operand:
     """Polynomial Σ c_k x^k by Horner's rule."""
-    total = 0.0 * x
+    total = 0.0 * x  # 0 of the type and shape of x
     for coefficient in reversed(coefficients):
         total = total * x + coefficient
     return total

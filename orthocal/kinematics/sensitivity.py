@@ -23,7 +23,7 @@ from orthocal.robot.closing import invert_closures
 from orthocal.robot.model import Robot, require_tcp
 
 POSTURE_BLOCK_SIZE = 64
-"""Postures per block if placements depend on the posture; one needs 300 kB."""
+"""Number of postures per block if placements depend on the posture; one needs 300 kB."""
 
 
 class ToolSensitivity:
@@ -71,8 +71,8 @@ class ToolSensitivity:
     ) -> Array:
         """Evaluate ∂p/∂θ at commanded drive coordinates.
 
-        Placements depend on the command only if effects make them. Derivatives are then taken in
-        blocks of postures, for their memory.
+        If effects make placements depend on the command, postures are evaluated in blocks to limit
+        memory.
 
         Args:
             drives: Shape (K, n_drives), [m, rad], or commands, shape (K, n_command).
@@ -85,6 +85,7 @@ class ToolSensitivity:
 
         Raises:
             ClosureError: If a posture cannot be reached.
+            LinAlgError: If passive coordinates are passed and a posture is singular.
         """
         coordinates = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
@@ -117,7 +118,7 @@ class ToolSensitivity:
         )
 
     def _differentiate(self, commands: Array, passive: Array, placement_jacobian: Array) -> Array:
-        """Equation of the module.
+        """Evaluate the equation of the module's docstring.
 
         Args:
             commands: Shape (K, n_command).

@@ -1,4 +1,4 @@
-"""Points of a tool that turns as it moves."""
+"""Displacement of tool points by the rotation of a tool that turns as it moves."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot, require_tcp
 
 CONVERGED = 1e-10
-"""Change of a position that ends the iteration, [m]."""
+"""Change of a position below which the iteration has converged, [m]."""
 
 MAX_ITERATIONS = 60
-"""Most iterations. Each reduces the change by about the distance of the point, in rod lengths."""
+"""Largest number of iterations. Each multiplies the change by about the distance of the point from
+the tool centre point divided by the rod length."""
 
 
 def rotation_shift(robot: Robot, points: Array, offset: ArrayLike) -> Array:
@@ -41,9 +42,9 @@ def rotation_shift(robot: Robot, points: Array, offset: ArrayLike) -> Array:
 
 
 def place_turning(robot: Robot, points: Array, offset: ArrayLike) -> Array:
-    """Tool coordinates p at which a point of the tool is where a tool without rotation has it.
+    """Tool coordinates p at which a point of the tool is where it would be without rotation.
 
-    The equation p + R(p) t = x + t is solved for p by iteration.
+    The equation p + R(p) t = x + t is solved for p by fixed-point iteration.
 
     Args:
         robot: The robot.

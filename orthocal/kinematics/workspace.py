@@ -26,16 +26,17 @@ DEFAULT_HALF_SIDE = 0.06
 """Half the side of the largest default cube, [m]."""
 
 POINTS_PER_SIDE = 5
-"""Nodes per side of a quadrature grid."""
+"""Number of nodes per side of a quadrature grid."""
 
 CELLS_PER_SIDE = 12
-"""Cells per side of the uniform grid from which percentiles are computed."""
+"""Number of cells per side of the uniform grid from which percentiles are computed."""
 
 BED_SLACK = 1e-6
 """Rounding error by which the tool may be below a bed, [m]."""
 
 FEWEST_ALIGNED = 4
-"""Fewest points for which a rotation is removed; with fewer it would absorb most of the errors."""
+"""Smallest number of points for which a rotation is removed. With fewer points it would absorb most
+of the errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +57,7 @@ class Workspace:
     requested: Array | None = None
     """Box in the robot's YAML if the machine does not reach all of it, [m]."""
     n_conditions: int = 1
-    """Conditions of use for which the points are repeated."""
+    """Number of conditions of use for which the points are repeated."""
 
     @classmethod
     def even(cls, points: ArrayLike) -> Workspace:
@@ -132,7 +133,7 @@ class Workspace:
 
         Returns:
             Values at the centres, shape (M, ...), and their equal weights, shape (M,). If the
-            points form no grid, the field and the weights of its points.
+            points form no grid, these are the field itself and the weights of its points.
         """
         if self.nodes is None:
             return field, self.weights
@@ -305,7 +306,7 @@ def position_at_zero(robot: Robot) -> Array:
 
 
 def find_below_bed(robot: Robot, points: Array, names: Sequence[str] | None = None) -> Failures:
-    """Rows of tool positions below the bed of the machine, with the reason; none without a bed.
+    """Indices of tool positions below the bed of the machine, with the reason; none without a bed.
 
     Args:
         robot: The robot.
@@ -360,10 +361,10 @@ def _scale_to(box: Array, points: Array, robot: Robot) -> Array:
 
 
 def _lobatto_points(count: int) -> Array:
-    """Nodes of Lobatto's rule: ±1 and the roots of the Jacobi polynomial P(1,1) of degree n-2.
+    """Nodes of Lobatto's rule: ±1 and the roots of the Jacobi polynomial P(1,1) of degree n − 2.
 
-    The roots are the eigenvalues of the Jacobi matrix, whose squared off-diagonal elements are
-    k (k + 2) / ((2 k + 1) (2 k + 3)). Importing scipy.special for them takes too long.
+    n is the count. The roots are the eigenvalues of the Jacobi matrix, whose squared off-diagonal
+    elements are k (k + 2)/((2 k + 1) (2 k + 3)). The import of scipy.special takes too long.
     """
     k = np.arange(1.0, count - 2)
     squares = k * (k + 2.0) / ((2.0 * k + 1.0) * (2.0 * k + 3.0))

@@ -1,1 +1,1 @@
-"""Predicted readings: linearisation, batches, simulation."""
+"""Prediction, linearisation and simulation of readings."""

@@ -1,4 +1,4 @@
-"""Conditions of the readings of a session: schedule and temperatures of a day."""
+"""Conditions of the readings of a session: times and temperatures of a day of measurement."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ COLUMNS_OF_CONDITIONS: dict[Condition, str] = {
     "temperature": "temperature_C",
     "time": "time",
 }
-"""Columns of a readings.csv that state conditions of readings. Other conditions belong to the
+"""Conditions of a reading, mapped to their columns of readings.csv. Other conditions belong to the
 machine or to the session."""
 
 
@@ -47,7 +47,8 @@ def schedule_readings(
 ) -> Session:
     """Session with times of successive readings, and temperatures that change linearly with time.
 
-    Approaches remain. Differences have no conditions. The coordinates of a point have one time.
+    Approaches are unchanged. Differences have no conditions. All coordinates of a point have the
+    same time.
 
     Args:
         session: The session.
@@ -62,13 +63,13 @@ def schedule_readings(
     if not setups:
         return session
     usual, durations = (MINUTES_PER_SETUP, MINUTES_PER_READING), durations or {}
-    of_setup = {name: durations.get(gauge, usual) for name, gauge in names.values()}
-    steps = [of_setup[a][1] + of_setup[b][0] * (a != b) for a, b in pairwise(setups)]
+    duration_of = {name: durations.get(gauge, usual) for name, gauge in names.values()}
+    # the gauge is mounted again between readings of different setups
+    steps = [duration_of[a][1] + duration_of[b][0] * (a != b) for a, b in pairwise(setups)]
     minutes = np.repeat(np.cumsum([0.0, *steps]), [len(line) for line in lines])
     neutral = neutral_values(session.robot)["temperature"]
-    at_readings = np.interp(
-        minutes, [0.0, max(float(minutes[-1]), 1e-9)], temperatures or (neutral, neutral)
-    )
+    end = max(float(minutes[-1]), 1e-9)  # above 0 also for a single reading
+    at_readings = np.interp(minutes, [0.0, end], temperatures or (neutral, neutral))
     readings = []
     for reading, minute, temperature in zip(session.readings, minutes, at_readings, strict=True):
         if reading.minus is None:

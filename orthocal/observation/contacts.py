@@ -25,6 +25,9 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
 
     Returns:
         Names of setups with readings, mapped to the names of the postures and the contacts in them.
+
+    Raises:
+        ClosureError: If the nominal machine cannot reach a posture.
     """
     place = _nominal_places(session)
     postures = {name: i for i, name in enumerate(session.postures)}
@@ -45,8 +48,10 @@ def centre_balls(session: Session, setups: Iterable[str]) -> Session:
 
     Args:
         session: The session.
-        setups: Setups whose balls are centred. A ball that is aligned in the mechanical zero
-            keeps its place.
+        setups: Names of setups. A ball that is aligned in the mechanical zero keeps its position.
+
+    Raises:
+        ClosureError: If the nominal machine cannot reach a posture.
     """
     balls = balls_aligned_elsewhere(session)
     chosen = [name for name in setups if name in balls]
@@ -66,7 +71,7 @@ def balls_aligned_elsewhere(session: Session) -> dict[str, tuple[BallIndicator, 
     """Setups with a ball that is not aligned in the mechanical zero.
 
     Returns:
-        Names of setups, mapped to the indicator and its alignment posture.
+        Names of setups, mapped to the indicator and the name of its alignment posture.
     """
     aligned_at = session.alignment_postures
     return {

@@ -13,11 +13,11 @@ Half of the resolution would be too little for gauges that scatter by more than 
 0.001 mm and a scatter of 0.03 mm, correct readings would count as mistakes."""
 
 USUAL_STDS = 4.0
-"""Largest usual difference of two readings of one posture, in standard deviations of a difference:
-of about 16,000 correct ones one is larger."""
+"""Largest usual difference of two readings of one posture, in standard deviations of a difference.
+Of about 16,000 correct differences one is larger."""
 
 USUAL_STEPS = 3
-"""The same in steps of a gauge whose noise is not stated."""
+"""Largest usual difference, in steps of the resolution, of a gauge whose noise is not stated."""
 
 ROUNDING_ERROR = 1e-9
 """Rounding error of a difference of two readings, [m]."""
@@ -29,8 +29,8 @@ SMALLEST_SIGMA = 1e-9
 def noise_floor(gauge_sigma: float | None, resolution: float | None) -> float:
     """Lower limit of the standard deviation of a reading, [m].
 
-    It combines the stated noise of the gauge and rounding, 1/√12 of the resolution, because a small
-    scatter of few readings does not disprove them.
+    It combines the stated noise of the gauge and rounding, 1/√12 of the resolution. A smaller
+    scatter of few readings does not disprove these.
     """
     return math.hypot(gauge_sigma or 0.0, (resolution or 0.0) / math.sqrt(12.0))
 
@@ -43,7 +43,7 @@ def stated_sigma(gauge: Gauge) -> float:
 def usual_difference(gauge: Gauge) -> float:
     """Largest usual difference of two readings of one posture, [m]; 0 if unknown.
 
-    It is a multiple of the resolution.
+    It is a multiple of the resolution, if the gauge states one.
     """
     step = gauge.resolution or 0.0
     if not gauge.sigma:

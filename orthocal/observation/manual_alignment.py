@@ -30,7 +30,8 @@ class ManualAlignment:
     sensitivity: Array
     """S, derivative with respect to all elementary errors, shape (n_nuisance, n_errors), [SI]."""
     start: Array
-    """Value without errors, −S θ_active plus that of adjustments, shape (n_nuisance,), [SI]."""
+    """Value for θ = 0: −S θ_active, plus the effect of mechanical adjustments between the setup and
+    the end of the session, shape (n_nuisance,), [SI]."""
 
     def __call__(self, errors: Array) -> Array:
         """Nuisance parameters of aligned gauges.
@@ -72,7 +73,7 @@ def list_alignments(session: Session, nuisance: NuisanceParameters) -> list[Alig
         if not nuisance.of_setup[i]:  # without readings
             continue
         virtual = setup.sensor.aligned_to(session.robot)
-        # the parameters of effects, which follow, are not aligned
+        # not strict: parameters of effects follow those of the sensor, and are not aligned
         for index, parameter in zip(
             nuisance.of_setup[i], setup.sensor.nuisance_parameters, strict=False
         ):

@@ -42,13 +42,14 @@ from orthocal.robot.closing import invert_closures
 from orthocal.session.session import Session
 
 MAX_POSTURES, MAX_READINGS = 64, 640
-"""Most postures and readings of a block, so that its Jacobians fit the processor's cache."""
+"""Largest numbers of postures and readings of a block. Its Jacobians then fit the processor's
+cache."""
 
 MAX_PREDICTED = 4096
-"""Readings of all machines per call of a prediction, which limits the memory of their inputs."""
+"""Largest number of readings of all machines per call of a prediction, to limit memory."""
 
 MIN_SPARSE_ROWS = 400
-"""Rows from which a product with a sparse matrix is faster than with a dense one."""
+"""Number of rows from which a product with a sparse matrix is faster than with a dense one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,13 +86,15 @@ class _Readings:
     value: Array
     """h, shape (S, k m), [m]."""
     by_drive_errors: Array
-    """Derivative through posture and reference posture, shape (S, k m, n_drive_errors)."""
+    """Derivative of h with respect to the drive errors, which change the posture and the reference
+    posture, shape (S, k m, n_drive_errors)."""
     by_passive: Array
     """h_q, shape (S, k m, n_passive)."""
     by_nuisance: Array
     """h_ν for one unit of each nuisance parameter, shape (S, k m, n_nuisance_columns)."""
     by_alignment: Array | None
-    """Derivative through the manual alignment, shape (S, k m, n_machine); None without any."""
+    """Part of dh/dθ̂ that is due to the manual alignment, shape (S, k m, n_machine); None without
+    alignment."""
     by_twists: Sequence[tuple[Indices, Indices, Array]]
     """For each sensor group: positions of its readings, (n,), columns of the nonzeros of ∂h/∂ξ,
     (nnz,), and the nonzeros, (S, n, nnz)."""
@@ -209,8 +212,9 @@ class ObservationModel:
             nuisance: Nuisance parameters as deviations from the manual alignment, shape
                 (n_nuisance,) or (S, n_nuisance), [SI]; 0 by default.
             free: The free parameters.
-            noise_ratio: Divisor of each entry's reading, shape (n_entries,); 1 by default.
-            aligned: Add the manual alignment to the nuisance parameters.
+            noise_ratio: Divisor of each entry's reading (see `CalibrationProblem`), shape
+                (n_entries,); 1 by default.
+            aligned: True to add the manual alignment to the nuisance parameters.
 
         Raises:
             LinAlgError: If a posture is singular.
@@ -380,7 +384,7 @@ class ReadingLinearisation:
         alignment: Derivative of the nuisance parameters with respect to errors, shape
             (n_nuisance, n_errors).
         noise_ratio: Divisor of each entry's reading, shape (n_entries,).
-        batch: Keep the leading dimension of results.
+        batch: True to keep the leading dimension of results.
 
     Attributes:
         reading: h at the passive coordinates, shape (S, n_entries), [m].
@@ -572,6 +576,7 @@ def predict_readings(
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
+        ParameterError: If a name is unknown.
     """
     model = ObservationModel(session, observations)
     closure = LoopClosure(session.robot, fixed=errors)
@@ -597,7 +602,8 @@ def nominal_sensitivity(session: Session, unit_errors: Array | None = None) -> A
     model, closure = ObservationModel(session), LoopClosure(session.robot)
     units = np.eye(len(model.functions.errors.names)) if unit_errors is None else unit_errors
     n = len(model.nuisance.parameters)
-    free = model.parametrise(units, np.ones(n), np.zeros(n, dtype=np.int64))  # they are not needed
+    # derivatives with respect to nuisance parameters are not needed: they share one column
+    free = model.parametrise(units, np.ones(n), np.zeros(n, dtype=np.int64))
     passive = closure.close(model.states.commands, names=model.states.names)
     linear = model.linearise(closure.errors(), passive, free=free, aligned=False)
     return linear.jacobian[:, : units.shape[1]]

@@ -50,7 +50,8 @@ class States:
     variant_commands: Array
     """Commands with each of these conditions, shape (n_variants, n_command)."""
     names: tuple[str, ...]
-    """Name of the posture of each state, with a number if the posture has several states."""
+    """Name of the posture of each state, with a number if the posture has several states, such as
+    "p1 #2"."""
 
     @property
     def first_of_posture(self) -> Indices:
@@ -153,7 +154,7 @@ class Observations:
     def rows(self, entries: Array) -> Array:
         """Rows of the session, shape (n_rows, ...), from values of the entries, shape (n, ...)."""
         is_difference = (self.minus >= 0).reshape(-1, *(1,) * (entries.ndim - 1))
-        subtracted = np.where(is_difference, entries[self.minus], 0.0)
+        subtracted = np.where(is_difference, entries[self.minus], 0.0)  # not used where minus is -1
         return np.asarray(entries[self.plus] - subtracted)
 
     def values(self, rows: Array) -> Array:
@@ -181,7 +182,12 @@ class Observations:
 
 
 def build_observations(session: Session) -> Observations:
-    """Split the readings of a session into single readings with gauge zeros."""
+    """Split the readings of a session into single readings with gauge zeros.
+
+    Raises:
+        SessionError: If readings of pairs of postures and effects on the geometry exclude each
+            other.
+    """
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
     entries: list[tuple[int, int, int]] = []
@@ -245,7 +251,7 @@ def _observe(
     table: Indices,
     pairs: Mapping[int, int],
 ) -> tuple[dict[Condition, Array], States, Indices, Indices]:
-    """Conditions of entries, loop closures, and the closures of each entry.
+    """Conditions of the entries, loop closures, and the index of the closure of each entry.
 
     Args:
         session: The session.
@@ -271,7 +277,7 @@ def _observe(
 
 
 def _require_common_placements(states: States, session: Session, pairs: bool) -> None:
-    """Refuse pairs of postures on a machine whose placements differ between postures.
+    """Refuse readings of pairs of postures on a machine whose placements differ between states.
 
     Raises:
         SessionError: If there are such pairs; names the session.
@@ -374,7 +380,10 @@ def _find_loads(session: Session, setup: Indices, posture: Indices) -> Array:
 
 
 def adjustment_table(session: Session) -> Array:
-    """Adjustments of the setups minus those of the session, (n_setups, n_adjustments), [m]."""
+    """Mechanical adjustments of the setups minus those of the session, [m].
+
+    Shape (n_setups, n_adjustments).
+    """
     names, last = list(session.robot.declared.adjustments), session.adjusted
     result = np.zeros((len(session.setups), len(names)))
     for row, setup in zip(result, session.setups.values(), strict=True):
@@ -385,7 +394,14 @@ def adjustment_table(session: Session) -> Array:
 
 
 def _find_trims(session: Session, setup: Indices, posture: Indices, approach: Array) -> Array:
-    """Displacement of the drives by the controller at entries, shape (n, n_drives), [m, rad]."""
+    """Displacements of the drives by compensations of the controller, (n, n_drives), [m, rad].
+
+    Args:
+        session: The session.
+        setup: Index of the setup of each entry, shape (n,).
+        posture: Index of the posture of each entry, shape (n,).
+        approach: Approach of each entry, shape (n, n_drives).
+    """
     result, drives = np.zeros(approach.shape), drive_table(session)
     active = session.robot.drive_zero - session.zero_drives
     for i, s in enumerate(session.setups.values()):
@@ -406,7 +422,8 @@ def _find_states(
         session: The session.
         posture: Index of the posture of each entry, shape (n,).
         conditions: Conditions of the entries.
-        trims: Displacement of the drives by the controller, shape (n, n_drives), [m, rad].
+        trims: Displacements of the drives by compensations of the controller, shape (n, n_drives),
+            [m, rad].
     """
     map_, drives, names = error_map(session.robot), drive_table(session), list(session.postures)
     postures, n_drives = np.arange(len(names)), drives.shape[1]
@@ -476,7 +493,7 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
 
 
 def _missing_condition(session: Session, condition: Condition, missing: Sequence[Reading]) -> str:
-    """Readings without a condition, with their lines, and what to fill in."""
+    """Beginning of a message: column and lines in which a condition is missing."""
     if missing[0].minus:
         return "belongs to two postures, so that it states no condition"
     first = missing[0].file or session.readings_path
@@ -490,7 +507,8 @@ def _missing_condition(session: Session, condition: Condition, missing: Sequence
 def readings_without(session: Session, condition: Condition) -> list[Reading]:
     """Readings that do not state a condition.
 
-    A setup without any time needs none: its rows are in the order of time.
+    A setup in which no reading states a time needs none: READING_INTERVAL is assumed between
+    successive rows.
     """
     if condition not in COLUMNS_OF_CONDITIONS:  # the session states it, or it is computed
         return []

@@ -16,8 +16,8 @@ from orthocal.sensors.protocol import NuisanceParameter, mirrored_parameters
 from orthocal.session.session import Session, Setup, split_label
 
 OF_GAUGE = "gauge."
-"""Beginning of the names of parameters of a gauge, which all its setups share, and all sessions
-that state the same nominal value."""
+"""Beginning of the names of parameters of a gauge. All setups of the gauge share them, and so do
+all sessions that state the same nominal value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,8 +61,8 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
             of_setup.append(())
             continue
         setup_parameters = [
-            Parameter(_full_name(u, setup, session), u.unit, u.prior_std, ())
-            for u in setup.sensor.nuisance_parameters
+            Parameter(_full_name(p, setup, session), p.unit, p.prior_std, ())
+            for p in setup.sensor.nuisance_parameters
         ]
         setup_parameters += [
             Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.prior_std, (), e.positive)
@@ -84,7 +84,7 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
 
 
 def nominal_values(session: Session) -> dict[str, float]:
-    """Nuisance parameter to the nominal value of its quantity, [unit], if that is not 0."""
+    """Names of nuisance parameters, mapped to the nominal values of their quantities unless 0."""
     return {name: p.nominal for _, p, name in _list_parameters(session) if p.nominal}
 
 
@@ -99,7 +99,7 @@ def shared_gauge_parameters(session: Session, measured: Session) -> dict[str, st
     """Parameters of gauges that a session shares with existing readings that it is joined with.
 
     Returns:
-        Name in the session to name in the existing readings.
+        Names in the session, mapped to the names in the existing readings.
     """
     existing = dict(_gauge_parameters(measured))
     return {name: existing[key] for key, name in _gauge_parameters(session) if key in existing}
@@ -134,17 +134,18 @@ def _full_name(parameter: NuisanceParameter, setup: Setup, session: Session) -> 
 
 
 def fixed_parameters(session: Session) -> set[str]:
-    """Nuisance parameters of parts of a printer, which all its logs share."""
+    """Names of nuisance parameters of fixed parts of a printer, which all its logs share."""
     if session.firmware is None:
         return set()
     return {name for _, p, name in _list_parameters(session) if p.fixed}
 
 
 def _shared_gauge(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
-    """Gauge that owns a parameter of a gauge.
+    """Name of the gauge that owns a parameter of a gauge.
 
-    Joined sessions share it if they state the same nominal value, such as the length of a bar.
-    The sessions with another value than the first one have a gauge with the label of theirs.
+    Joined sessions share the gauge if they state the same nominal value, such as the length of a
+    bar. If a session states another value than the first one, its gauge has the label of the
+    session.
     """
     _, gauge = split_label(setup.gauge, joined=session.joined)
     if not session.joined:

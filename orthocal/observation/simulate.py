@@ -1,4 +1,7 @@
-"""Simulated readings of a machine with known errors, always marked as simulated."""
+"""Simulated readings of a machine with known errors.
+
+Sessions of simulated readings are always marked as such.
+"""
 
 from __future__ import annotations
 
@@ -32,11 +35,12 @@ from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import MM, to_mm
 
 LARGEST_ZERO = 0.2e-3
-"""Limit of the uniform distribution of the first reading of a setup, [m]."""
+"""Largest distance of the first reading of a setup from the middle of the range, [m]. The first
+reading is uniformly distributed."""
 
 SPARE_NOISE = 5.0
-"""Distance of readings from the ends of the range for which an operator sets the dial more exactly,
-in standard deviations of their noise."""
+"""Distance that all readings keep from the ends of the range if possible, in standard deviations of
+their noise. If necessary, the operator sets the dial closer to the middle of the range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +72,7 @@ def draw_errors(
         robot: The robot.
         patterns: Names or globs of the parameters to draw; '!' excludes. If a sum and its terms are
             selected, only the terms are drawn.
-        seed: Seed of the random numbers; `simulate_session` with this seed draws others.
+        seed: Seed of the random numbers; `simulate_session` with the same seed draws other numbers.
         tolerances: Names or globs with their unit, such as `*.offset_mm`, mapped to tolerances that
             replace those of the robot.
 
@@ -76,7 +80,8 @@ def draw_errors(
         Names of the parameters, mapped to values, [SI].
 
     Raises:
-        ParameterError: If a pattern matches nothing.
+        ParameterError: If a pattern matches nothing, or a tolerance is not valid.
+        TypeError: If an argument has a wrong type.
     """
     require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
     patterns = require_names(patterns, argument="patterns")
@@ -115,7 +120,8 @@ def simulate_session(
             range of the gauge.
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the name of an error is unknown.
-        ValueError: If `sigma` is no number of at least 0.
+        TypeError: If an argument has a wrong type.
+        ValueError: If sigma is not a number of at least 0.
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
     require_numbers(errors, argument="errors")
@@ -213,8 +219,8 @@ def show_readings(
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
     if sigma is None and not exact:
         used = dict.fromkeys(s.gauge for s in plan.setups.values())
-        silent = [name for name in used if plan.gauges[name].sigma is None]
-        plan.refuse_missing(silent, "sigma_mm", ": the noise to simulate is not stated")
+        without_noise = [name for name in used if plan.gauges[name].sigma is None]
+        plan.refuse_missing(without_noise, "sigma_mm", ": the noise to simulate is not stated")
     noise = np.array([(g.sigma if sigma is None else sigma) or 0.0 for g in gauges])
     # the operator sets the dial near the middle of its range in the first posture of a setup
     zeros = dict.fromkeys(plan.setups, 0.0)
@@ -222,7 +228,7 @@ def show_readings(
         if setup.zero == "known":
             continue
         of_setup = entries[observations.setup == i]
-        first = float(of_setup[:1].sum())
+        first = float(of_setup[:1].sum())  # 0 for a setup without readings
         zeros[name] = gauges[i].middle - first
         if not exact:
             zeros[name] += _draw_setting(of_setup - first, gauges[i], noise[i], rng)
@@ -238,9 +244,9 @@ def show_readings(
 
 
 def _draw_setting(deviations: Array, gauge: Gauge, sigma: float, rng: np.random.Generator) -> float:
-    """Reading of the first posture of a setup, from the middle of the gauge's range, [m].
+    """First reading of a setup relative to the middle of the gauge's range, [m].
 
-    If all readings can be within the range, it is so small that they are.
+    It keeps all readings of the setup within the range if this is possible.
 
     Args:
         deviations: Exact readings minus the first one, shape (n,), [m].
@@ -282,7 +288,9 @@ class _TruthKeys(Keys):
     ] = {}
     """Mechanical adjustments of the machine that has these errors."""
     zeros_mm: dict[str, Number] = {}
+    """Gauge zeros by setup; not used."""
     sensors: dict[str, Number] = {}
+    """Nuisance parameters by name with unit."""
 
 
 def load_errors(
@@ -294,18 +302,18 @@ def load_errors(
 ) -> dict[str, float]:
     """Load errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
 
-    A gauge keeps its errors: those that the file lists under `sensors`, such as the scale of a dial
-    or the length of a bar, are loaded too. Setups are mounted again.
+    A gauge keeps its errors, such as the scale of a dial or the length of a bar. They are loaded
+    from `sensors` of the file. Setups are mounted again, so that their mounting errors are ignored.
 
     The errors are those of a machine with the mechanical adjustments `adjusted_mm` of the file, by
-    default none. The differences to `adjusted` are added to them.
+    default none. The differences between `adjusted` and these adjustments are added.
 
     Args:
         path: The file, such as a truth.yaml.
         robot: The robot.
         nuisance: Nuisance parameters of the plan to simulate.
-        adjusted: Mechanical adjustments of the machine to simulate, name to amount, [m]; None
-            without a conversion of the errors.
+        adjusted: Mechanical adjustments of the machine to simulate: names, mapped to amounts, [m].
+            None leaves the errors as in the file.
 
     Returns:
         Names of parameters, mapped to values, [SI].
@@ -338,7 +346,7 @@ def collect_errors(
     adjusted: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Collect errors drawn from priors, of a file and of single texts; later ones replace earlier.
+    """Collect errors that are drawn, from a file and from single texts; later ones replace earlier.
 
     Args:
         robot: The robot.
@@ -410,13 +418,18 @@ def read_errors(
 
 
 def quantity(parameter: Parameter, value: float) -> tuple[str, float]:
-    """Key of a truth.yaml with the unit of a parameter, and its value [SI] in this unit."""
+    """Key of a parameter in truth.yaml, and a value in the unit of the key.
+
+    Args:
+        parameter: The parameter.
+        value: The value, [SI].
+    """
     key = f"{parameter.name}_{parameter.edge_unit}"
     return key, _nine_digits(value * parameter.edge_factor)
 
 
 def _nine_digits(value: float) -> float:
-    """A number that does not depend on rounding errors of the simulation."""
+    """Number with nine digits, so that files do not depend on rounding errors of the simulation."""
     return float(f"{value:.9g}")
 
 

@@ -1,7 +1,7 @@
 """Derivatives of readings and closures with respect to the twists of placements.
 
-Machine parameters θ̂ change placements by twists ∂ξ/∂θ̂. `ClosurePattern` holds the nonzeros of
-∂g/∂ξ, `TwistChain` applies the chain rule from ξ to θ̂.
+Machine parameters θ̂ move placements by twists ξ (see `error_map`). `ClosurePattern` holds the
+nonzeros of ∂g/∂ξ of the loop closures g. `TwistChain` applies the chain rule from ξ to θ̂.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class FreeParameters:
     nuisance_scale: Array
     """Values of one unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
     nuisance_columns: Indices
-    """Column of each nuisance parameter after those of the machine parameters, (n_nuisance,).
-    Parameters on which no reading depends together may share a column."""
+    """Column of each nuisance parameter, counted after the machine parameters, (n_nuisance,).
+    Parameters may share a column if no reading depends on more than one of them."""
     pattern: ClosurePattern
     """Nonzeros of ∂g/∂ξ for the twists ξ that the machine parameters change."""
 
@@ -56,7 +56,12 @@ class ClosurePattern:
 
     @staticmethod
     def of(functions: RobotFunctions, unit_errors: Array) -> ClosurePattern:
-        """Pattern for parameters; one unit of each are elementary errors, (n_errors, n)."""
+        """Pattern for parameters.
+
+        Args:
+            functions: Functions of the robot.
+            unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
+        """
         moved = functions.errors.twists_moved_by(unit_errors).reshape(-1, 6).any(axis=1)
         used = np.flatnonzero(np.repeat(moved, 6))
         position = np.full(functions.n_twists, -1)
@@ -162,7 +167,10 @@ class TwistChain:
         return result
 
     def _by_varying(self, varying: VaryingDerivatives, rows: Array, variant: Indices) -> Array:
-        """Contribution of the placements that vary to the result of a call."""
+        """Contribution of the placements that vary to the result of a call.
+
+        Derivatives with respect to ξ are multiplied by T, then by ∂δ (see `VaryingDerivatives`).
+        """
         by_xi = np.where(self._positions >= 0, rows[:, :, self._positions], 0.0)
         by_delta = by_xi.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
         by_delta = by_delta.reshape(*rows.shape[:2], -1)
@@ -173,7 +181,7 @@ class TwistChain:
         """Twists ∂ξ for changes of machine parameters.
 
         Args:
-            change: Changes, shape (D, n_machine, 1).
+            change: D changes of θ̂, shape (D, n_machine, 1).
 
         Returns:
             Shape (D, 1, n_twists), or (D, V, n_twists) if placements vary under V conditions.

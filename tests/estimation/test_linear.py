@@ -76,8 +76,9 @@ def test_the_rank_of_the_rows_does_not_depend_on_their_unit():
 
 
 def test_rows_of_one_leg_do_not_determine_three_offsets():
-    with pytest.raises(NotIdentifiableError):
+    with pytest.raises(NotIdentifiableError) as refused:
         invert_equation_8(leg_parallelism_matrix(**GEOMETRY, rows=6)[[2, 3]])
+    assert refused.value.parameters == ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 
 
 def test_the_closed_loop_model_agrees_to_first_order_with_equation_8(experiment_2):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
 
 from orthocal import load_plan
+from orthocal.kinematics import function_cache
 from orthocal.kinematics.backend import batch_function, llvm
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.robot_functions import robot_functions
@@ -173,3 +176,12 @@ def test_a_small_function_is_not_cached(tmp_path, monkeypatch):
     batch = BatchFunction(lambda: ca.Function("small", [x], [2.0 * x]), key="a key")
     assert_same(batch([[3.0]], backend="llvm"), (np.array([[6.0]]),))
     assert not (tmp_path / "cache").exists()
+
+
+def test_a_change_of_the_backend_changes_the_keys_of_cached_functions(monkeypatch):
+    before, read = function_cache._code(), Path.read_bytes
+    changed = {Path(llvm.__file__), Path(batch_function.__file__)}
+    monkeypatch.setattr(
+        Path, "read_bytes", lambda path: read(path) + b"#" if path in changed else read(path)
+    )
+    assert function_cache._code.__wrapped__() != before

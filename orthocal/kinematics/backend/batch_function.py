@@ -20,15 +20,15 @@ from orthocal.runtime import disk_cache
 Backend = Literal["casadi", "llvm"]
 
 LARGE_BLOCK, SMALL_BLOCK = 32, 8
-"""Points of one call of a mapped CasADi function."""
+"""Numbers of points of one call of a mapped CasADi function."""
 
 CALL_COST = 2500
-"""Duration of a call, in instructions."""
+"""Overhead of a call, as the number of instructions that take as long."""
 
 MIN_POINTS, MIN_OPERATIONS = 3, 2e3
-"""Points, and points times instructions, from which a call uses the LLVM backend. It needs as long
-for 8 points as CasADi for two, and for 32 points as for three. Each of its
-interpreters starts in 0.02 s."""
+"""Number of points, and points times instructions, from which a call uses the LLVM backend. Its
+duration for 8 points is that of CasADi for two, and for 32 points that of CasADi for three. Each of
+its interpreters starts in 0.02 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Layout:
 
     n_instructions: int
     widths: Sequence[int]
-    """Number of coordinates of each input."""
+    """Length of each input, which is a column vector."""
     names: Sequence[str]
     """Names of the outputs."""
     shapes: Sequence[tuple[int, int]]
@@ -143,7 +143,11 @@ class BatchFunction:
         return 0 if 0 in counts else max(counts, default=1)
 
     def _require_shapes(self, arrays: Sequence[Array], count: int) -> None:
-        """Refuse inputs beyond which the LLVM backend would read memory."""
+        """Refuse inputs of other shapes, for which the LLVM backend would read beyond their memory.
+
+        Raises:
+            ValueError: If an input has another shape.
+        """
         widths = self.layout.widths
         fit = [a.shape[1:] for a in arrays] == [(n,) for n in widths]
         if not fit or (count and any(count % len(a) for a in arrays)):
@@ -182,7 +186,7 @@ class BatchFunction:
         return results
 
     def _block_size(self, count: int) -> int:
-        """Points of the next call; may exceed the remaining ones if that saves calls."""
+        """Number of points of the next call; more than the remaining ones if that saves calls."""
         if count >= LARGE_BLOCK:
             return LARGE_BLOCK
         surplus = (SMALL_BLOCK - count) * self.layout.n_instructions
@@ -201,7 +205,7 @@ class BatchFunction:
 class _MappedBlock:
     """Function mapped over a number of points, with its input and output memory.
 
-    CasADi converts results through Python lists; its buffers avoid that.
+    A usual call of CasADi converts results through Python lists. Buffers avoid this conversion.
     """
 
     def __init__(self, function: ca.Function, size: int) -> None:

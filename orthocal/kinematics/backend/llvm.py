@@ -2,9 +2,9 @@
 
 A CasADi function of scalar expressions is a list of instructions. An interpreter in machine code,
 compiled by llvmlite for the present processor, executes each instruction for several points at
-once.
-Its operations are those of CasADi's virtual machine, in the same order, correctly rounded or from
-the C library. The numbers are therefore the same, in about a tenth of the time.
+once. Its operations are those of CasADi's virtual machine in the same order. They are correctly
+rounded or come from the C library. The numbers are therefore identical, in about a tenth of the
+time.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from orthocal.arrays import Array, Indices
 from orthocal.runtime import disk_cache
 
 LANES = (8, 16, 32)
-"""Points for which an interpreter executes one instruction at once. Reading an instruction takes as
-long as executing it for some 16 points."""
+"""Numbers of points for which an interpreter executes one instruction at once. An instruction takes
+as long to read as to execute for about 16 points."""
 
 MIN_CACHED = 1000
 """Smallest number of instructions of a function whose program is cached on disk."""
 
+# y: result; a, b: operands; p, q, r: intermediate values; row: type of a vector of doubles
 _COMPUTED = {
     "ASSIGN": "{y} = select i1 true, {row} {a}, {row} {a}",
     "ADD": "{y} = fadd {row} {a}, {b}",
@@ -49,6 +50,7 @@ _COMPUTED = {
     "{r} = select {flags} {q}, {row} {one}, {row} {a}\n"
     "{y} = select {flags} {p}, {row} {minus}, {row} {r}",
 }
+# p is the result as flags
 _COMPARED = {
     "LT": "{p} = fcmp olt {row} {a}, {b}",
     "LE": "{p} = fcmp ole {row} {a}, {b}",
@@ -117,6 +119,7 @@ def store_program(key: str, program: Program) -> None:
 
 
 def _disk_key(key: str) -> str:
+    """Key of the instructions on disk, which contains the codes of the operations."""
     return f"instructions {_CODES}\n{key}"
 
 
@@ -318,9 +321,9 @@ class _Source:
                     self._store("double", value, self._at(end, to, "double"))
             elif name == "CONST":
                 value = self._load("double", self._at("%constants", k, "double"))
-                one = self._new(f"insertelement {self._row} poison, double {value}, i32 0")
-                same = f"<{self._lanes} x i32> zeroinitializer"
-                row = self._new(f"shufflevector {self._row} {one}, {self._row} poison, {same}")
+                first = self._new(f"insertelement {self._row} poison, double {value}, i32 0")
+                zeros = f"<{self._lanes} x i32> zeroinitializer"  # all lanes copy lane 0
+                row = self._new(f"shufflevector {self._row} {first}, {self._row} poison, {zeros}")
                 self._store(self._row, row, to_row)
             elif name in _CALLED:
                 rows = [a_row, b_row][: _CALLED[name]]
@@ -374,7 +377,7 @@ class _Source:
         return self._new(f"getelementptr {kind}, ptr {array}, i64 {index}")
 
     def _load(self, kind: str, place: str) -> str:
-        """Value at an address."""
+        """Value at an address; vectors are aligned like doubles, as NumPy allocates them."""
         align = ", align 8" if kind == self._row else ""
         return self._new(f"load {kind}, ptr {place}{align}")
 
