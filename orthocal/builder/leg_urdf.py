@@ -28,6 +28,7 @@ COLOURS = {
     "green": (0.25, 0.58, 0.32),
     "blue": (0.22, 0.41, 0.75),
 }
+"""Names of materials, mapped to red, green and blue, from 0 to 1."""
 
 LEG_COLOURS = ("red", "green", "blue")
 """Colours of the legs, in their order."""
@@ -36,6 +37,9 @@ _, Y, Z = np.eye(3)
 """Axes of the hinges in the frame of a leg."""
 
 QUARTER_TURN = 0.5 * np.pi
+
+HINGE_RANGE = (-1.3, 1.3)
+"""Limits of a hinge, [rad]."""
 
 ROUNDING = 1e-14
 """Largest rounding error of an angle, [rad]."""
@@ -138,7 +142,7 @@ def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: 
 
     Legs of two rods keep the orientation of the platform: the first leg carries it, the others end
     in pins on it. Legs of one rod (`rods_apart` is 0) meet in the tool centre point. The foot of
-    the first leg, which turns on its rod, carries the platform; a closure joins it to the last rod.
+    the first leg turns on its rod and carries the platform. A closure joins it to the last rod.
 
     Args:
         name: Name of the robot.
@@ -254,12 +258,12 @@ def _at(position: Array) -> tuple[Array, Array]:
 
 
 def _root(leg: LegGeometry) -> tuple[Array, Array]:
-    """Middle of the hinge on the slide, and axes of the leg, in the slide's frame."""
+    """Placement of the leg's frame, at the middle of its hinge, in the slide's frame."""
     return leg.frame.T @ (leg.root - leg.slide), leg.frame.T @ leg.axes
 
 
 def _to_tool(leg: LegGeometry) -> tuple[Array, Array]:
-    """Tool centre point and axes of the world, in the frame of the leg's foot."""
+    """Placement of the tool's frame, which is that of the world, in the frame of the leg's foot."""
     return -leg.axes.T @ leg.tip, leg.axes.T
 
 
@@ -317,13 +321,13 @@ def _hinge(
     axis: Array,
     shapes: Sequence[Shape] = (),
 ) -> None:
-    """Add a link on a revolute joint of ±1.3 rad."""
+    """Add a link on a revolute joint with the limits HINGE_RANGE."""
     joint = _attach(root, name, "revolute", (parent, child), placement, shapes)
-    _limit(joint, axis, (-1.3, 1.3))
+    _limit(joint, axis, HINGE_RANGE)
 
 
 def _limit(joint: etree._Element, axis: Array, limits: tuple[float, float]) -> None:
-    """Add axis and limits to a joint."""
+    """Add axis and limits, [m, rad], to a joint."""
     etree.SubElement(joint, "axis", xyz=_numbers(axis))
     low, high = map(_number, limits)
     others = {key: _number(v) for key, v in LIMITS.items()}
@@ -340,7 +344,7 @@ def _origin(owner: etree._Element, position: Array, rotation: Array) -> None:
 
 
 def _exact_angle(angle: float) -> float:
-    """Angle without rounding errors of multiples of a quarter turn, [rad]; π instead of −π."""
+    """Angle, [rad], without the rounding error of a multiple of a quarter turn; π instead of −π."""
     quarters = round(angle / QUARTER_TURN)
     exact = (2 if quarters == -2 else quarters) * QUARTER_TURN
     return exact if abs(angle - quarters * QUARTER_TURN) < ROUNDING else angle
@@ -352,5 +356,5 @@ def _numbers(values: Sequence[float] | Array) -> str:
 
 
 def _number(value: float) -> str:
-    """Number with 15 significant digits."""
+    """Number with at most 15 decimals and 15 significant digits, without a negative zero."""
     return f"{round(value, 15) + 0.0:.15g}"
