@@ -46,7 +46,7 @@ class Dimension:
 
     @property
     def count(self) -> int:
-        """Number of numbers in the value."""
+        """Count of numbers in a value."""
         return self.form.count(self.separator) + 1 if self.separator else 1
 
     def to_si(self, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - a float or a tuple
