@@ -36,7 +36,10 @@ PLATE = np.array([0.02, 0.02, 0.012])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Biglide(SlidingLegs):
-    """Dimensions of two crossed slides with legs that move the tool in their plane, [m]."""
+    """Dimensions of two crossed slides with legs that move the tool in their plane, [m].
+
+    Legs of one rod have `rods_apart` 0.
+    """
 
     attachment: float = 0.06
 
@@ -64,7 +67,8 @@ class Biglide(SlidingLegs):
         """Name and problem of the first impossible dimension; None if all are possible."""
         if not self.single:
             return SlidingLegs.find_problem(self)
-        apart = 4.0 * abs(self.rod_radius)  # a single rod needs no clearance from another one
+        # a plausible distance in place of the 0, because a single rod has no other one beside it
+        apart = 4.0 * abs(self.rod_radius)
         problem = SlidingLegs.find_problem(replace(self, rods_apart=apart))
         if problem is None and self.attachment:
             return "rods_apart", (

@@ -32,6 +32,8 @@ from orthocal.robot.model import Robot
 
 __all__ = ["describe_machine", "make_robot", "remake_robot"]
 
+# Parts of a robot's YAML that follow from machine.yaml. They are replaced as text, so that comments
+# and other changes are preserved.
 _FEET_SECTION = re.compile(
     rf"(?m)^ *# {re.escape(FEET)}\n(?: *#.*\n)* *adjustments:.*\n(?: {{4,}}.*\n)*"
 )
@@ -63,12 +65,12 @@ def describe_machine(
         counting: Relation of the controller's joints to the drives; by default they are equal.
         description: YAML of the robot to change; by default that of the kind.
         tolerances: Tolerances that replace those of the kind, by error name or glob with its unit,
-            such as *.offset_mm. They are not used with a description.
-        effects: Effects beside geometry, with their default keys, or mapped to other keys. They are
-            not used with a description.
+            such as *.offset_mm.
+        effects: Effects beside geometry, with their default keys, or mapped to other keys.
 
     Raises:
-        RobotError: If the dimensions are impossible, or the YAML lacks the line of one of them.
+        RobotError: If the dimensions are impossible, an effect does not exist, or the YAML lacks
+            the line of a dimension or of the tolerances.
     """
     if impossible := dimensions.find_problem():
         raise RobotError(impossible[1], where="dimensions")
@@ -106,7 +108,7 @@ def make_robot(
         effects: Effects beside geometry, with their default keys, or mapped to other keys.
 
     Raises:
-        RobotError: If the dimensions are impossible, or an effect has no default keys.
+        RobotError: If the dimensions are impossible, or an effect does not exist or lacks a key.
         OrthocalError: If the directory cannot be written.
     """
     folder = Path(folder)
@@ -128,7 +130,7 @@ def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None
 
     Raises:
         RobotError: If there is no machine.yaml, its dimensions are impossible, or the YAML lacks
-            the line of one of them.
+            the line of one of them; also if the new robot does not load or fails the check.
         OrthocalError: If the directory cannot be written.
     """
     dimensions, counting = read_machine(folder / MACHINE)
@@ -159,10 +161,10 @@ def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None
 def _complete_yaml(
     base: str, dimensions: Dimensions, counting: Sequence[Counting], file: str, *, is_new: bool
 ) -> str:
-    """YAML with the zeros of drives, radii of rods, joints, workspace and adjustments of a machine.
+    """YAML of a robot with the zeros, rod radii, joints, workspace and adjustments of a machine.
 
     Args:
-        base: YAML of the robot.
+        base: YAML of the robot to change.
         dimensions: Dimensions of the machine.
         counting: Relation of the controller's joints to the drives.
         file: Name of the YAML, for messages.
@@ -198,11 +200,16 @@ def _complete_yaml(
 
 
 def _effects_text(effects: Sequence[str] | EffectKeyValues) -> str:
-    """Effects beside geometry with their default limits, or with stated keys, as YAML."""
+    """YAML of effects beside geometry, with their default keys unless others are stated.
+
+    Raises:
+        RobotError: If an effect does not exist.
+    """
     stated = effects if isinstance(effects, Mapping) else {}
     lines = []
     for name in order_effects(effects):
         fields = find_effect(name, where="effects", error=RobotError).keys.model_fields.items()
+        # required keys, vectors and mappings have no number as default
         keys = {key: f.default for key, f in fields if isinstance(f.default, float)}
         keys |= stated.get(name, {})
         mapping = json.dumps(keys).replace('"', "")  # in YAML's flow style without quotes

@@ -41,12 +41,12 @@ class Dimension:
 
     @property
     def separator(self) -> str:
-        """Character between several numbers."""
+        """Character between several numbers; "" for one number."""
         return next((c for c in ":," if c in self.form), "")
 
     @property
     def count(self) -> int:
-        """Number of values."""
+        """Count of numbers in a value."""
         return self.form.count(self.separator) + 1 if self.separator else 1
 
     def to_si(self, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - a float or a tuple
@@ -190,7 +190,8 @@ def find_rods_problem(apart: float, radius: float, leg: float) -> tuple[str, str
     """
     if radius > 0.0 and 2.0 * radius < apart <= leg:
         return None
-    return "rod_radius" if 0.0 < apart <= leg else "rods_apart", (
+    name = "rod_radius" if 0.0 < apart <= leg else "rods_apart"
+    return name, (
         f"rods of radius {in_mm(radius)} mm, {in_mm(apart)} mm apart; "
         f"expected a radius above 0, and a distance above twice the radius and at most "
         f"{in_mm(leg)} mm"
@@ -198,17 +199,22 @@ def find_rods_problem(apart: float, radius: float, leg: float) -> tuple[str, str
 
 
 def in_mm(value: float) -> str:
-    """Length in mm as text, without the rounding error of the factor."""
+    """Length, [m], in mm as text (see `in_unit`)."""
     return in_unit(value, "mm")
 
 
 def in_unit(value: float, unit: str) -> str:
-    """Number in mm or degrees as text, without the rounding error of the factor."""
+    """Number in mm or degrees as text, without the rounding error of the factor.
+
+    Args:
+        value: Length or angle, [m, rad].
+        unit: mm or deg.
+    """
     return f"{round(value / UNITS[unit], 9) + 0.0:.12g}"
 
 
 def box_text(box: Sequence[Sequence[float]] | None) -> str:
-    """Box in mm as YAML; "" if it is None."""
+    """YAML of a box in mm from its limits, [m]; "" if it is None."""
     if box is None:
         return ""
     return f"[{', '.join(f'[{in_mm(a)}, {in_mm(b)}]' for a, b in box)}]"

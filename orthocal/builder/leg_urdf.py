@@ -28,6 +28,7 @@ COLOURS = {
     "green": (0.25, 0.58, 0.32),
     "blue": (0.22, 0.41, 0.75),
 }
+"""Names of materials, mapped to red, green and blue, from 0 to 1."""
 
 LEG_COLOURS = ("red", "green", "blue")
 """Colours of the legs, in their order."""
@@ -36,6 +37,9 @@ _, Y, Z = np.eye(3)
 """Axes of the hinges in the frame of a leg."""
 
 QUARTER_TURN = 0.5 * np.pi
+
+HINGE_RANGE = (-1.3, 1.3)
+"""Limits of a hinge, [rad]."""
 
 ROUNDING = 1e-14
 """Largest rounding error of an angle, [rad]."""
@@ -128,7 +132,7 @@ def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment:
     for leg in legs:
         _add_leg(root, leg, body)
         if leg is not first:
-            _fixed(root, f"{leg.name}_foot_end", f"{leg.name}_foot", _to_tool(leg))
+            _add_fixed(root, f"{leg.name}_foot_end", f"{leg.name}_foot", _tool_placement(leg))
     _add_platform(root, f"{first.name}_foot", first, body)
     return _text(root, comment)
 
@@ -138,7 +142,7 @@ def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: 
 
     Legs of two rods keep the orientation of the platform: the first leg carries it, the others end
     in pins on it. Legs of one rod (`rods_apart` is 0) meet in the tool centre point. The foot of
-    the first leg, which turns on its rod, carries the platform; a closure joins it to the last rod.
+    the first leg turns on its rod and carries the platform. A closure joins it to the last rod.
 
     Args:
         name: Name of the robot.
@@ -151,23 +155,27 @@ def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: 
     if body.rods_apart:
         for leg in legs:
             _add_slide(root, leg, body)
-            _fixed(root, f"{leg.name}_yoke", f"{leg.name}_slider", _root(leg), _yoke(body))
+            _add_fixed(
+                root, f"{leg.name}_yoke", f"{leg.name}_slider", _root_placement(leg), _yoke(body)
+            )
             _add_parallelogram(root, leg, body)
         _add_platform(root, f"{first.name}_leg_tip", first, body)
         for leg in others:
-            _fixed(root, f"{leg.name}_pin", "platform", _at(leg.tip))
+            _add_fixed(root, f"{leg.name}_pin", "platform", _at(leg.tip))
         return _text(root, comment)
     for leg in legs:
         k = leg.name
         _add_slide(root, leg, body)
-        _fixed(root, f"{k}_leg_root", f"{k}_slider", _root(leg))
-        _hinge(root, f"{k}_bar", f"{k}_slider", f"{k}_rod", _root(leg), Y, _rod(leg, body))
+        _add_fixed(root, f"{k}_leg_root", f"{k}_slider", _root_placement(leg))
+        _add_hinge(
+            root, f"{k}_bar", f"{k}_slider", f"{k}_rod", _root_placement(leg), Y, _rod(leg, body)
+        )
         end = _at(np.array([leg.length, 0.0, 0.0]))
         if leg is first:
-            _hinge(root, f"{k}_end", f"{k}_rod", f"{k}_foot", end, Y)
+            _add_hinge(root, f"{k}_end", f"{k}_rod", f"{k}_foot", end, Y)
             continue
-        _fixed(root, f"{k}_foot", f"{k}_rod", end)
-        _fixed(root, f"{k}_end", f"{k}_foot", _to_tool(leg))
+        _add_fixed(root, f"{k}_foot", f"{k}_rod", end)
+        _add_fixed(root, f"{k}_end", f"{k}_foot", _tool_placement(leg))
     _add_platform(root, f"{first.name}_foot", first, body)
     return _text(root, comment)
 
@@ -178,7 +186,7 @@ def _robot(name: str, body: Body) -> etree._Element:
     for colour, rgb in COLOURS.items():
         material = etree.SubElement(root, "material", name=colour)
         etree.SubElement(material, "color", rgba=_numbers([*rgb, 1.0]))
-    _link(root, "base", body.base)
+    _add_link(root, "base", body.base)
     return root
 
 
@@ -191,28 +199,30 @@ def _text(root: etree._Element, comment: str) -> str:
 
 def _add_platform(root: etree._Element, parent: str, leg: LegGeometry, body: Body) -> None:
     """Add platform and tool centre point to the link at the end of a leg."""
-    _fixed(root, "platform", parent, _to_tool(leg), body.platform)
-    _fixed(root, "tcp", "platform", _at(np.zeros(3)))
+    _add_fixed(root, "platform", parent, _tool_placement(leg), body.platform)
+    _add_fixed(root, "tcp", "platform", _at(np.zeros(3)))
 
 
 def _add_leg(root: etree._Element, leg: LegGeometry, body: Body) -> None:
     """Add slide and leg of a spatial machine."""
     k = leg.name
     _add_slide(root, leg, body)
-    _hinge(root, f"{k}_swivel", f"{k}_slider", f"{k}_yoke", _root(leg), Z, _yoke(body))
+    _add_hinge(
+        root, f"{k}_swivel", f"{k}_slider", f"{k}_yoke", _root_placement(leg), Z, _yoke(body)
+    )
     _add_parallelogram(root, leg, body)
     knuckle, down = [Shape((0.012, 0.024), "dark")], -0.5 * body.rods_apart * Z
-    _hinge(root, f"{k}_wrist", f"{k}_crossbar", f"{k}_knuckle", _at(down), Z, knuckle)
-    _hinge(root, f"{k}_fork", f"{k}_knuckle", f"{k}_foot", _at(np.zeros(3)), Y, [body.foot])
+    _add_hinge(root, f"{k}_wrist", f"{k}_crossbar", f"{k}_knuckle", _at(down), Z, knuckle)
+    _add_hinge(root, f"{k}_fork", f"{k}_knuckle", f"{k}_foot", _at(np.zeros(3)), Y, [body.foot])
 
 
 def _add_slide(root: etree._Element, leg: LegGeometry, body: Body) -> None:
     """Add the slide of a leg."""
-    k, (to_root, _) = leg.name, _root(leg)
+    k, (to_root, _) = leg.name, _root_placement(leg)
     slider = [Shape(s.sizes, s.material, to_root + s.position, s.rotation) for s in body.slider]
     place = (leg.slide - leg.zero * leg.direction, leg.frame)
-    joint = _attach(root, f"{k}_slide", "prismatic", ("base", f"{k}_slider"), place, slider)
-    _limit(joint, leg.frame.T @ leg.direction, leg.travel)
+    joint = _add_joint(root, f"{k}_slide", "prismatic", ("base", f"{k}_slider"), place, slider)
+    _add_limit(joint, leg.frame.T @ leg.direction, leg.travel)
 
 
 def _add_parallelogram(root: etree._Element, leg: LegGeometry, body: Body) -> None:
@@ -221,13 +231,13 @@ def _add_parallelogram(root: etree._Element, leg: LegGeometry, body: Body) -> No
     tip, down = _at(np.array([leg.length, 0.0, 0.0])), -half * Z
     for rod, side in (("a", half * Z), ("b", down)):
         name, shapes = f"{k}_rod_{rod}", _rod(leg, body)
-        _hinge(root, f"{k}_bar_{rod}", f"{k}_yoke", name, _at(side), Y, shapes)
-    _fixed(root, f"{k}_rod_b_tip", f"{k}_rod_b", tip)
+        _add_hinge(root, f"{k}_bar_{rod}", f"{k}_yoke", name, _at(side), Y, shapes)
+    _add_fixed(root, f"{k}_rod_b_tip", f"{k}_rod_b", tip)
     crossbar = [Shape((0.009, body.rods_apart + 0.02), "steel", down)]
-    _hinge(root, f"{k}_coupler", f"{k}_rod_a", f"{k}_crossbar", tip, Y, crossbar)
-    _fixed(root, f"{k}_crossbar_end", f"{k}_crossbar", _at(2.0 * down))
-    _fixed(root, f"{k}_leg_root", f"{k}_yoke", _at(np.zeros(3)))
-    _fixed(root, f"{k}_leg_tip", f"{k}_crossbar", _at(down))
+    _add_hinge(root, f"{k}_coupler", f"{k}_rod_a", f"{k}_crossbar", tip, Y, crossbar)
+    _add_fixed(root, f"{k}_crossbar_end", f"{k}_crossbar", _at(2.0 * down))
+    _add_fixed(root, f"{k}_leg_root", f"{k}_yoke", _at(np.zeros(3)))
+    _add_fixed(root, f"{k}_leg_tip", f"{k}_crossbar", _at(down))
 
 
 def _yoke(body: Body) -> list[Shape]:
@@ -253,22 +263,22 @@ def _at(position: Array) -> tuple[Array, Array]:
     return position, np.eye(3)
 
 
-def _root(leg: LegGeometry) -> tuple[Array, Array]:
-    """Middle of the hinge on the slide, and axes of the leg, in the slide's frame."""
+def _root_placement(leg: LegGeometry) -> tuple[Array, Array]:
+    """Placement of the leg's frame, at the middle of its hinge, in the slide's frame."""
     return leg.frame.T @ (leg.root - leg.slide), leg.frame.T @ leg.axes
 
 
-def _to_tool(leg: LegGeometry) -> tuple[Array, Array]:
-    """Tool centre point and axes of the world, in the frame of the leg's foot."""
+def _tool_placement(leg: LegGeometry) -> tuple[Array, Array]:
+    """Placement of the tool's frame, which is that of the world, in the frame of the leg's foot."""
     return -leg.axes.T @ leg.tip, leg.axes.T
 
 
-def _link(root: etree._Element, name: str, shapes: Sequence[Shape]) -> None:
+def _add_link(root: etree._Element, name: str, shapes: Sequence[Shape]) -> None:
     """Add a link with its shapes."""
     link = etree.SubElement(root, "link", name=name)
     for shape in shapes:
         visual = etree.SubElement(link, "visual")
-        _origin(visual, shape.position, shape.rotation)
+        _add_origin(visual, shape.position, shape.rotation)
         geometry = etree.SubElement(visual, "geometry")
         if len(shape.sizes) == 3:
             etree.SubElement(geometry, "box", size=_numbers(shape.sizes))
@@ -280,7 +290,7 @@ def _link(root: etree._Element, name: str, shapes: Sequence[Shape]) -> None:
         etree.SubElement(visual, "material", name=shape.material)
 
 
-def _attach(
+def _add_joint(
     root: etree._Element,
     name: str,
     kind: str,
@@ -289,15 +299,15 @@ def _attach(
     shapes: Sequence[Shape],
 ) -> etree._Element:
     """Add a link with its shapes, and the joint between another link and it."""
-    _link(root, links[1], shapes)
+    _add_link(root, links[1], shapes)
     joint = etree.SubElement(root, "joint", name=name, type=kind)
     etree.SubElement(joint, "parent", link=links[0])
     etree.SubElement(joint, "child", link=links[1])
-    _origin(joint, *placement)
+    _add_origin(joint, *placement)
     return joint
 
 
-def _fixed(
+def _add_fixed(
     root: etree._Element,
     name: str,
     parent: str,
@@ -305,10 +315,10 @@ def _fixed(
     shapes: Sequence[Shape] = (),
 ) -> None:
     """Add a link that is fixed to another one."""
-    _attach(root, f"{name}_mount", "fixed", (parent, name), placement, shapes)
+    _add_joint(root, f"{name}_mount", "fixed", (parent, name), placement, shapes)
 
 
-def _hinge(
+def _add_hinge(
     root: etree._Element,
     name: str,
     parent: str,
@@ -317,20 +327,20 @@ def _hinge(
     axis: Array,
     shapes: Sequence[Shape] = (),
 ) -> None:
-    """Add a link on a revolute joint of ±1.3 rad."""
-    joint = _attach(root, name, "revolute", (parent, child), placement, shapes)
-    _limit(joint, axis, (-1.3, 1.3))
+    """Add a link on a revolute joint with the limits HINGE_RANGE."""
+    joint = _add_joint(root, name, "revolute", (parent, child), placement, shapes)
+    _add_limit(joint, axis, HINGE_RANGE)
 
 
-def _limit(joint: etree._Element, axis: Array, limits: tuple[float, float]) -> None:
-    """Add axis and limits to a joint."""
+def _add_limit(joint: etree._Element, axis: Array, limits: tuple[float, float]) -> None:
+    """Add axis and limits, [m, rad], to a joint."""
     etree.SubElement(joint, "axis", xyz=_numbers(axis))
     low, high = map(_number, limits)
     others = {key: _number(v) for key, v in LIMITS.items()}
     etree.SubElement(joint, "limit", lower=low, upper=high, **others)
 
 
-def _origin(owner: etree._Element, position: Array, rotation: Array) -> None:
+def _add_origin(owner: etree._Element, position: Array, rotation: Array) -> None:
     """Add the origin of a joint or a visual."""
     roll, pitch, yaw = (_exact_angle(float(v)) for v in pin.rpy.matrixToRpy(rotation))
     if abs(pitch) == QUARTER_TURN:  # then only yaw ∓ roll is determined
@@ -340,7 +350,7 @@ def _origin(owner: etree._Element, position: Array, rotation: Array) -> None:
 
 
 def _exact_angle(angle: float) -> float:
-    """Angle without rounding errors of multiples of a quarter turn, [rad]; π instead of −π."""
+    """Angle, [rad], without the rounding error of a multiple of a quarter turn; π instead of −π."""
     quarters = round(angle / QUARTER_TURN)
     exact = (2 if quarters == -2 else quarters) * QUARTER_TURN
     return exact if abs(angle - quarters * QUARTER_TURN) < ROUNDING else angle
@@ -352,5 +362,5 @@ def _numbers(values: Sequence[float] | Array) -> str:
 
 
 def _number(value: float) -> str:
-    """Number with 15 significant digits."""
+    """Number with at most 15 decimals and 15 significant digits, without a negative zero."""
     return f"{round(value, 15) + 0.0:.15g}"

@@ -106,22 +106,25 @@ class LinearDelta(Dimensions):
     @property
     def zero(self) -> float:
         """Height of a slide with the tool in the middle of the bed (the mechanical zero), [m]."""
+        # a dialogue asks for it before both dimensions are known and checked
         return math.sqrt(max(self.rod**2 - self.radius**2, 0.0))
 
     @property
     def box(self) -> tuple[tuple[float, float], ...]:
-        """Limits of the workspace, [m]: the stated one, or a box that the rods reach.
+        """Limits of the workspace, [m]: the stated ones, or those of a box that the rods reach.
 
-        The box extends at most half the radius to each side. Its limits are whole centimetres, or
+        The box extends about half the radius to each side. Its limits are whole centimetres, or
         whole millimetres in small boxes.
         """
         if self.workspace is not None:
             return self.workspace
+        # a corner of the box is √2 half from the middle, and may be opposite a tower
         half = min(
             0.5 * self.radius, (MAX_RELATIVE_DISTANCE * self.rod - self.radius) / math.sqrt(2.0)
         )
         step = 0.01 if half >= 0.05 else 0.001
         half = step * math.floor(half / step + 0.5)
+        # a slide is highest with the steepest rod: with the tool in the corner near its tower
         near = max(self.radius - math.sqrt(2.0) * half, 0.0)
         top = min(self.radius, self.travel[1] - math.sqrt(self.rod**2 - near**2))
         top = step * math.floor(top / step + ROUNDING)
@@ -172,7 +175,7 @@ class LinearDelta(Dimensions):
         )
 
     def legs(self) -> list[LegGeometry]:
-        """Legs a, b and c."""
+        """Legs a, b and c in the mechanical zero."""
         legs = []
         for name, colour, angle in zip(self.letters, LEG_COLOURS, self.angles, strict=True):
             outwards = np.array([math.cos(angle), math.sin(angle), 0.0])

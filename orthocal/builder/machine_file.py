@@ -23,11 +23,12 @@ from orthocal.robot.description import WorkspaceBox
 from orthocal.units import MM
 
 MACHINE = "machine.yaml"
+"""Name of the file."""
 
 KINDS: dict[str, type[Dimensions]] = {
     k.kind: k for k in (Orthoglide, InclinedOrthoglide, LinearDelta, Biglide)
 }
-"""Name in machine.yaml and on the command line, to the class of dimensions."""
+"""Names of kinds in machine.yaml and on the command line, mapped to their classes."""
 
 USUAL = Orthoglide.kind
 """Default kind."""
@@ -41,7 +42,7 @@ class Counting:
     """Relation of a controller's joint to the drive coordinate."""
 
     up: bool = True
-    """Whether the joint coordinate grows with the drive coordinate."""
+    """True if the joint coordinate grows with the drive coordinate."""
     at_zero: float | None = None
     """Joint coordinate in the mechanical zero, [m]; None if it equals the drive coordinate."""
 
@@ -51,7 +52,12 @@ AS_DRIVE = Counting()
 
 
 def find_counting_problem(counting: Sequence[Counting], count: int) -> str | None:
-    """Problem of the stated joints of `count` drives; None without one."""
+    """Problem of the stated joints of a machine; None without one.
+
+    Args:
+        counting: Stated joints.
+        count: Number of drives.
+    """
     if len(counting) != count:
         return f"has {len(counting)} joints; expected {count}"
     for joint in counting:
@@ -115,7 +121,7 @@ def _keys_of(kind: type[Dimensions]) -> type[BaseModel]:
 
 
 def _type_of(dimension: Dimension) -> Any:  # noqa: ANN401 - a type
-    """Type of the value of a key."""
+    """Type of the value of a key in machine.yaml: a number, or a list of them."""
     if not dimension.separator:
         return Number
     count = dimension.count
@@ -123,7 +129,7 @@ def _type_of(dimension: Dimension) -> Any:  # noqa: ANN401 - a type
 
 
 def machine_text(dimensions: Dimensions, counting: tuple[Counting, ...]) -> str:
-    """Text of machine.yaml."""
+    """Text of the machine.yaml of a machine, with the joints of its controller."""
     kind = type(dimensions)
     lines = [
         "# Dimensions of this machine, in mm. After a change, run in this directory:",
@@ -153,12 +159,12 @@ def machine_text(dimensions: Dimensions, counting: tuple[Counting, ...]) -> str:
 
 
 def joint_text(joint: Counting) -> str:
-    """Joint as YAML within braces."""
+    """YAML of a joint, for use within braces."""
     counts = f"counts: {'up' if joint.up else 'down'}"
     return counts if joint.at_zero is None else f"{counts}, at_zero_mm: {in_mm(joint.at_zero)}"
 
 
 def drive_text(dimensions: Dimensions, joint: Counting) -> str:
-    """Drive in the robot's YAML, within braces."""
+    """YAML of a drive with its zero and joint, for use within braces."""
     zero = f"zero_mm: {in_mm(dimensions.zero)}"
     return zero if joint == AS_DRIVE else f"{zero}, joint: {{{joint_text(joint)}}}"

@@ -1,4 +1,4 @@
-"""Dimensions of the Orthoglide, and of an Orthoglide with differently inclined slides."""
+"""Dimensions of the Orthoglide, and of an Orthoglide with inclined slides."""
 
 from __future__ import annotations
 
@@ -50,8 +50,10 @@ DRAWN_SLIDE = (
 """Shapes of a slide, in its frame relative to the middle of its hinge."""
 
 DRAWN_FOOT = Shape((0.028, 0.018, 0.018), "dark", np.array([0.014, 0.0, 0.0]))
+"""Shape of a foot, in the leg's frame."""
 
 DRAWN_PLATFORM = (Shape((0.034, 0.034, 0.034), "brass"), Shape((0.004,), "brass"))
+"""Shapes of the platform and of a ball at the tool centre point, in the tool's frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,11 +115,12 @@ class SlidingLegs(Dimensions):
 
     @abstractmethod
     def frames(self) -> list[Array]:
-        """Frames of the slides, shape (3, 3) each: X from slide to tool, Z as of the leg."""
+        """Frames of the slides, shape (3, 3) each: X from slide to tool, Z that of the leg."""
 
     def legs(self) -> list[LegGeometry]:
         """Legs in the mechanical zero."""
         legs = []
+        # a biglide has two legs, fewer than colours
         for name, colour, frame in zip(self.letters, LEG_COLOURS, self.frames(), strict=False):
             outwards = -frame[:, 0]
             slide, tip = self.leg * outwards, self.attachment * outwards
@@ -144,9 +147,8 @@ class SlidingLegs(Dimensions):
     def rail(self) -> tuple[float, float]:
         """Position of a drawn rail's middle along its axis, and its length, [m]."""
         lower, upper = self.travel
-        return 0.5 * (
-            lower + upper
-        ) + self.attachment + SLIDER_DISTANCE, upper - lower + RAIL_OVERHANG
+        middle = 0.5 * (lower + upper) + self.attachment + SLIDER_DISTANCE
+        return middle, upper - lower + RAIL_OVERHANG
 
     def drawn_platform(self) -> Sequence[Shape]:
         """Shapes of the platform in the tool's frame."""
@@ -180,7 +182,7 @@ class Orthoglide(SlidingLegs):
     letters: ClassVar[str] = "xyz"
 
     def frames(self) -> list[Array]:
-        """Frames of the slides; Z is the axis that precedes the slide's axis cyclically."""
+        """Frames of the slides; Z is the axis before that of the slide in the cycle x, y, z."""
         axes = np.eye(3)
         return [
             np.column_stack([-axes[i], np.cross(axes[i - 1], -axes[i]), axes[i - 1]])
@@ -198,10 +200,11 @@ class Orthoglide(SlidingLegs):
         inner, outer = middle - 0.5 * length, middle + 0.5 * length
         half = 0.5 * self.rods_apart
 
-        def point(axis: int, along: float, across: int = 0, beside: float = 0.0) -> str:
+        def point(axis: int, along: float, beside: float = 0.0) -> str:
+            """Point on the axis of a rail, or beside it along the next axis, [m]."""
             values = [0.0, 0.0, 0.0]
             values[axis] = along
-            values[(axis + across) % 3] += beside
+            values[(axis + 1) % 3] = beside
             return f"[{', '.join(in_mm(v) for v in values)}]"
 
         def unit(axis: int) -> str:
@@ -216,7 +219,7 @@ class Orthoglide(SlidingLegs):
                         f"{letter}_{end}_foot_{self.letters[k]}: {moves} {point(axis, position)}, "
                         f"direction: {unit(k)}, pivot_mm: {point(axis, pivot)}}}"
                     )
-            side, other = (point(axis, 0.5 * (inner + outer), 1, s * half) for s in (1.0, -1.0))
+            side, other = (point(axis, 0.5 * (inner + outer), s * half) for s in (1.0, -1.0))
             k = (axis + 2) % 3
             lines.append(
                 f"{letter}_side_foot_{self.letters[k]}: {moves} {side}, direction: {unit(k)}, "

@@ -33,7 +33,7 @@ class Loop:
     kind: str = "3d"
     """Kind in the Gepetto extended URDF: 3d or 6d."""
     rows: tuple[str, ...] = ()
-    """Rows of the closure that count; all by default."""
+    """Constrained rows of the closure; () for all."""
 
 
 def platform_loops(letters: str) -> list[Loop]:
@@ -49,7 +49,7 @@ def platform_loops(letters: str) -> list[Loop]:
 
 
 def parallelogram_loop(k: str) -> Loop:
-    """Planar loop of a leg with two rods."""
+    """Planar loop of a leg k with two rods."""
     return Loop(f"{k}_parallelogram", (f"{k}_crossbar_end", f"{k}_rod_b_tip"), "3d", ("x", "z"))
 
 
@@ -135,7 +135,7 @@ def _gepetto_lines(letters: str, loops: Sequence[Loop]) -> list[str]:
 
 
 def _rows(rows: Sequence[str]) -> str:
-    """YAML of the rows of a closure; "" for all rows."""
+    """YAML of the constrained rows of a closure; "" for all rows."""
     return f"rows: [{', '.join(rows)}]" if rows else ""
 
 

@@ -42,6 +42,9 @@ def express_machine(
     Returns:
         Actual drive coordinates, shape (n_drives,), [m, rad]; and the placements on which effects
         act, mapped to their twist δ, shape (6,), [m, rad].
+
+    Raises:
+        OrthocalError: If an effect returns no expression, or one of another shape.
     """
     actuated = commanded
     twists: dict[Placement, ca.SX] = {}

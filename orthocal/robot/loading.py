@@ -38,7 +38,7 @@ from orthocal.robot.model import (
     Use,
     build_constraints,
     coordinate_limits,
-    joint_axis,
+    joint_unit,
 )
 from orthocal.robot.parameters import AXES, ParameterSet, split_unit
 from orthocal.robot.reference_posture import find_reference_posture
@@ -243,7 +243,7 @@ def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> D
             f"the URDF has no moving joint '{motor}'; joints: {joints}", where=f"{where}: name_mot"
         )
     joint = model.joints[model.getJointId(motor)]
-    unit: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
+    unit = joint_unit(model, joint.id)
     here = f"{where}: orthocal.drives.{motor}"
     entry = keys.orthocal.drives.get(motor, DriveKeys())
     joint_keys = entry.joint or JointKeys()
@@ -373,7 +373,7 @@ def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
         if not model.existJointName(name) or name in keys.name_mot:
             raise RobotError(f"'{name}' is not a passive joint of the URDF", where=here)
         joint = model.joints[model.getJointId(name)]
-        expected: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
+        expected = joint_unit(model, joint.id)
         if unit != expected:
             raise RobotError(f"has the wrong unit; the joint is in {expected}", where=here)
         start[joint.idx_v] = value * factor
@@ -412,7 +412,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> Mapping[str, Leg]:
             axis=read_only(
                 _snap_to_axes((line["reference_tip"] - line["reference_root"]) / line["length"])
             ),
-            root_driven=bool(by_passive < 1e-9),
+            root_driven=bool(by_passive < 1e-9),  # up to rounding
             root_motion=read_only(_snap_to_axes(motion)),
             rods=MappingProxyType(rods),
         )

@@ -484,6 +484,7 @@ class Robot:
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
+            TypeError: If `tolerances` does not map names to numbers.
         """
         parameters = self.parameters.with_tolerances(tolerances)
         return self if parameters is self.parameters else replace(self, parameters=parameters)
@@ -498,7 +499,9 @@ class Robot:
             values: Names of parameters, mapped to values, [unit of the parameter].
 
         Raises:
-            ParameterError: If a name is unknown, or placements cannot express the error.
+            ParameterError: If a name is unknown, a value is not finite, or an error cannot be
+                expressed by placements.
+            TypeError: If `values` does not map names to numbers.
         """
         gain = np.array(self.drive_gain)
         twists: dict[Placement, Array] = {}
@@ -577,6 +580,11 @@ def joint_axis(model: pin.Model, joint: int) -> Array:
     return np.asarray(joint_data.S, dtype=np.float64).reshape(-1)
 
 
+def joint_unit(model: pin.Model, joint: int) -> Unit:
+    """SI unit of the coordinate of a joint with one degree of freedom: rad if it turns, else m."""
+    return "rad" if joint_axis(model, joint)[3:].any() else "m"
+
+
 def closure_turns(robot: Robot) -> Mask:
     """Mask of the closure rows that are rotations, shape (closure_rows,)."""
     return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
@@ -628,7 +636,7 @@ def closure_row_units(robot: Robot) -> Array:
 
 def coordinate_turns(model: pin.Model) -> Mask:
     """Mask of the joint coordinates that are rotations, shape (nv,)."""
-    turns = [joint_axis(model, i)[3:].any() for i in range(1, model.njoints)]
+    turns = [joint_unit(model, i) == "rad" for i in range(1, model.njoints)]
     return np.array(turns, dtype=np.bool_)
 
 

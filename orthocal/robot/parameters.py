@@ -281,6 +281,7 @@ class ParameterSet:
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
+            TypeError: If `tolerances` does not map names to numbers.
         """
         globs = self.read_tolerances(tolerances)
         matched = {name for glob in globs for name in self.select([glob])}
@@ -360,6 +361,7 @@ class ParameterSet:
 
         Raises:
             ParameterError: If a name or unit is unknown, or a glob is stated in two units.
+            TypeError: If `tolerances` does not map names to numbers.
         """
         require_numbers(tolerances, argument="tolerances")
         result: dict[str, float] = {}
@@ -379,6 +381,7 @@ class ParameterSet:
 
         Raises:
             ParameterError: If a name is unknown, or a value is not finite.
+            TypeError: If `values` does not map names to numbers.
         """
         require_numbers(values, argument="errors")
         totals: dict[str, float] = {}

@@ -77,7 +77,8 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     """Functions of a sensor's reading, built once for all sensors of its kind and frames.
 
     Raises:
-        OrthocalError: If sensors of one kind and with the same frames have different expressions.
+        OrthocalError: If sensors of one kind and with the same frames have different expressions,
+            or an expression is not a single one of CasADi.
     """
     pattern = ReadingPattern(robot, sensor, sensor.frames(robot))
     reading = _compile(pattern)
@@ -123,8 +124,8 @@ class ReadingPattern:
     def digests(self) -> tuple[str, ...]:
         """Digests of everything beside the name on which the expression depends.
 
-        Sensors and effects of other packages may use any property of the robot, so that the digest
-        of the robot is one of them.
+        Sensors and effects of other packages may use any property of the robot. Then a digest of
+        all its properties is among them.
         """
         effects = reading_effects(self.robot)
         kinds: list[type] = [type(self.sensor), *(type(e) for e in effects)]

@@ -73,7 +73,7 @@ BESIDE_ROUNDING = 1e-5
 LATERAL_DECIMALS = 9
 """Decimals of the lateral position of a centred ball in m; further ones are rounding errors."""
 
-Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
+Displacement = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
 
 class SectionKeys(OneKey):
@@ -96,7 +96,7 @@ class LegKeys(MountingKeys, SetupKeys):
     touches: str | None = None
     """Rod of the leg that the tip touches; None for the centre line between the rods."""
     tip: TipKeys | None = None
-    beside_mm: Annotated[list[Millimetres], Field(min_length=3, max_length=3)] | None = None
+    beside_mm: Annotated[list[Displacement], Field(min_length=3, max_length=3)] | None = None
     """Displacement of the tip from the rod in the mechanical zero, across leg and plunger, in the
     world frame. By default a ball is centred on the rod in the alignment posture; a blade is not
     displaced."""

@@ -42,6 +42,7 @@ ScaleTolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)]
 
 Millimetres = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MM)]
 Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
+"""Tolerances of positions and directions."""
 
 
 class MountingKeys(Keys):
@@ -94,7 +95,7 @@ class Mounting:
 
     @staticmethod
     def from_keys(keys: Any) -> Mounting:  # noqa: ANN401 - of any setup with MountingKeys
-        """Build from the keys of a session.yaml."""
+        """Build from the keys of a session.yaml, which inherit those of `MountingKeys`."""
         square = keys.square_tolerance_mrad
         return Mounting(
             direction=read_tolerance(keys.direction_tolerance_mrad, MRAD),

@@ -98,7 +98,11 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of the frames on which a reading depends."""
+    """Names of the frames on which a reading depends.
+
+    Raises:
+        TypeError: If a field is not a list of names.
+    """
 
     in_posture: tuple[str, ...]
     """Frames in the posture."""

@@ -2,8 +2,8 @@
 
 The artefact is clamped to the table. Its surface is a plane with normal n, nominally the direction
 d of the plunger in the reference posture. The tip q and the plunger's direction u move with the
-tool. The point q₀ of the nominal surface is the tip in the reference posture of the nominal machine
-if the gauge zero is free, otherwise the origin of the world frame:
+tool. The point q₀ of the nominal surface is the tip in the reference posture of the nominal
+machine, or for a probe the origin of the world frame:
 
     h = (1 + s) ((n · (q - q₀) + H) / (n · u) + f(q))
 
@@ -342,7 +342,7 @@ class ToolIndicator(ToolSensor):
         tool's frame (3), position of the tool centre point in the reference posture of the nominal
         machine (3), and a point of the surface (3).
         """
-        zero = robot.reference_pose(require_tcp(robot).frame)
+        reference = robot.reference_pose(require_tcp(robot).frame)
         a = self.artefact
         d, along = direction_vector(self.direction), self._along
         square_to_both = np.abs(np.cross(along, d))
@@ -352,10 +352,10 @@ class ToolIndicator(ToolSensor):
         share = sign * (-0.5 if is_first_arm else 0.5) * (a.kind == "square")
         level = a.table * float(d.sum())
         numbers = [0.5 * a.length, share, sign, a.height, level]
-        fixed = zero.rotation.T @ d
-        tip = zero.translation + zero.rotation @ np.array(self.tool)
-        point = tip if default_zero(self) == "free" else np.zeros(3)
-        places = [*fixed, *zero.translation, *point]
+        plunger_in_tool = reference.rotation.T @ d
+        tip = reference.translation + reference.rotation @ np.array(self.tool)
+        on_surface = tip if default_zero(self) == "free" else np.zeros(3)  # 0 for a probe
+        places = [*plunger_in_tool, *reference.translation, *on_surface]
         return np.array([*d, *along, *square_to_both, *self.tool, *numbers, *places])
 
     @property
@@ -380,7 +380,7 @@ class ToolIndicator(ToolSensor):
         c = view.constants
         plunger, along, across, tip = (c[i : i + 3] for i in (0, 3, 6, 9))
         half, share, sign, height, level = (c[i] for i in range(12, 17))
-        fixed, zero, point = (c[i : i + 3] for i in (17, 20, 23))
+        plunger_in_tool, reference, on_surface = (c[i : i + 3] for i in (17, 20, 23))
         (tool,) = view.frames
         q = tool.position + tool.rotation @ tip
         yaw = errors.get("yaw", 0.0) + share * errors.get("square", 0.0)
@@ -389,9 +389,10 @@ class ToolIndicator(ToolSensor):
         on_block = level - ca.dot(plunger, tool.position) > 0.5 * height
         block = ca.if_else(on_block, height + errors.get("height", 0.0), 0.0)
         block = ca.if_else(height > 0.0, block, 0.0)
-        s, t = (ca.dot(axis, q - zero) / half for axis in (along, across))
-        distance = ca.dot(normal, q - point) + block
-        reading = distance / ca.dot(normal, tool.rotation @ fixed) + sign * _form(errors, s, t)
+        s, t = (ca.dot(axis, q - reference) / half for axis in (along, across))
+        distance = ca.dot(normal, q - on_surface) + block
+        along_plunger = distance / ca.dot(normal, tool.rotation @ plunger_in_tool)
+        reading = along_plunger + sign * _form(errors, s, t)
         return ca.SX((1.0 + errors.get("scale", 0.0)) * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:

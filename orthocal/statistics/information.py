@@ -110,7 +110,14 @@ class Information:
         at_bound: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Posterior:
-        """Posterior of θ̂; the arguments are the fields of `Posterior`."""
+        """Posterior of θ̂.
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
+            at_bound: Mask of the parameters at a bound, shape (n_free,); none by default.
+            loss: Means of the loss function's derivatives (see `Posterior`).
+        """
         free = np.ones(len(precision), dtype=np.bool_) if at_bound is None else ~at_bound
         return Posterior(self.factor, sigma, precision, free, loss)
 
