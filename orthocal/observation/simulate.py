@@ -120,8 +120,9 @@ def simulate_session(
             range of the gauge.
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the name of an error is unknown.
+        RobotError: If closure rows of the robot are linearly dependent.
         TypeError: If an argument has a wrong type.
-        ValueError: If sigma is not a number of at least 0.
+        ValueError: If sigma is not a number of at least 0, or the seed is invalid.
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
     require_numbers(errors, argument="errors")
@@ -132,12 +133,7 @@ def simulate_session(
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
     nuisance = nuisance_parameters(plan).parameters
-    drawn = np.zeros(len(nuisance))
-    if nuisance and not exact:
-        # a separate generator, so that the noise does not depend on nuisance parameters
-        normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
-        drawn = normal * [p.prior_std for p in nuisance]
-        drawn = np.where([p.positive for p in nuisance], np.abs(drawn), drawn)
+    drawn = np.zeros(len(nuisance)) if exact else _draw_nuisance(nuisance, seed)
     truth = {p.name: errors.get(p.name, float(v)) for p, v in zip(nuisance, drawn, strict=True)}
     machine_errors = {name: value for name, value in errors.items() if name not in truth}
     entries = predict_readings(
@@ -158,6 +154,14 @@ def simulate_session(
         seed=seed,
     )
     return SimulatedSession(session, machine_errors, zeros, truth)
+
+
+def _draw_nuisance(nuisance: Sequence[Parameter], seed: int) -> Array:
+    """Draw nuisance parameters from their priors, shape (n_nuisance,), [SI]."""
+    # a separate generator, so that the noise does not depend on nuisance parameters
+    normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
+    drawn = normal * [p.prior_std for p in nuisance]
+    return np.asarray(np.where([p.positive for p in nuisance], np.abs(drawn), drawn))
 
 
 def _mark_title(title: str) -> str:
