@@ -551,7 +551,7 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
         size = drive.joint_size
         for i in np.flatnonzero(drive.is_beyond(values)).tolist():
             reason = (
-                f"has {drive.name}_{drive.joint_unit} {values[i] / size:g}; the drive reaches from "
+                f"{drive.name}_{drive.joint_unit} is {values[i] / size:g}; the drive reaches from "
                 f"{drive.lower / size:g} to {drive.upper / size:g}"
             )
             failures.setdefault(i, ClosureError(reason, posture=labels[i]))
