@@ -259,7 +259,7 @@ def fit_problem(
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
     fit = _solve_with_noise(program, linear, groups, start, rounds=rounds)
-    require_assembly(fit.problem, fit.solution, options=program.options)
+    require_reachable(fit.problem, fit.solution, options=program.options)
     seconds = built - began, time.perf_counter() - built
     return replace(fit, seconds_build=seconds[0], seconds_solve=seconds[1])
 
@@ -380,7 +380,7 @@ def floored_sigma(noise: Noise) -> float:
     return max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else math.nan
 
 
-def require_assembly(
+def require_reachable(
     problem: CalibrationProblem, solution: Solution, *, options: SolverOptions
 ) -> None:
     """Refuse a solution that cannot reach a posture. Wrong readings can lead to one.

@@ -14,7 +14,7 @@ from orthocal import Calibration, SolverOptions, calibrate, check_session, simul
 from orthocal.errors import SolverError
 from orthocal.estimation.diagnostics.deletion import diagnose_readings
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
-from orthocal.estimation.fit import fit_problem, require_assembly
+from orthocal.estimation.fit import fit_problem, require_reachable
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
@@ -192,9 +192,9 @@ def test_errors_that_make_no_machine_are_refused(readings):
     fit = fit_problem(build_problem(readings, model="offsets"))
     absurd = replace(fit.solution, theta=np.array([0.3, 0.0, 0.0]))
     with pytest.raises(SolverError, match="are impossible: posture 'zero' cannot be reached"):
-        require_assembly(fit.problem, absurd, options=SolverOptions())
+        require_reachable(fit.problem, absurd, options=SolverOptions())
     with pytest.raises(SolverError) as caught:
-        require_assembly(fit.problem, absurd, options=SolverOptions(loss=Loss("huber")))
+        require_reachable(fit.problem, absurd, options=SolverOptions(loss=Loss("huber")))
     assert "huber" not in str(caught.value)
 
 
