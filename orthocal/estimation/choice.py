@@ -162,7 +162,7 @@ def resolve_choice(
 def _require_used(
     tolerances: Mapping[str, float], parameters: ParameterSet, selection: Selection
 ) -> None:
-    """Refuse tolerances of sums that are not free, for which those of their terms are used."""
+    """Refuse tolerances of sums that are not free. Such sums have the tolerances of their terms."""
     used = {*selection.names, *parameters.elementary}
     for key in tolerances:
         glob, _ = parameters.read_glob(key)

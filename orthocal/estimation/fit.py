@@ -246,7 +246,7 @@ def fit_problem(
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
         SessionError: If a predicted reading is not finite at the active offsets.
         OrthocalError: If the solver does not accept an option.
-        SolverError: If the solver does not converge.
+        SolverError: If the solver does not converge, or its solution cannot reach a posture.
         ClosureError: If the machine cannot reach a posture.
     """
     began = time.perf_counter()
@@ -277,14 +277,14 @@ def _solve_with_noise(
     initial = initial_sigmas(problem.session, problem.observations)
     several = len(groups) > 1
     solution, sigma = _solve_first(program, linear, groups, start)
-    iterations, sides_compared = solution.iterations, True
+    iterations, mirrored = solution.iterations, True
     for remaining in reversed(range(rounds)):
         evaluation = _evaluate(program, solution, sigma, groups, initial)
         estimated, ratio = floored_sigma(evaluation.noises.common), evaluation.noises.ratio
         change = estimated / sigma * (ratio / problem.noise_ratio)  # of each entry's sigma
         converged = not math.isfinite(estimated) or _agrees(change)
         converged = converged or not (several or _depends_on_sigma(program))
-        if (converged and sides_compared) or not remaining:
+        if (converged and mirrored) or not remaining:
             break
         if not converged:
             sigma = estimated
@@ -292,12 +292,9 @@ def _solve_with_noise(
             problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
         # the better sides of mirrored directions may depend on sigma: compare them again at the end
-        sides_compared = converged or not len(problem.mirrored)
+        mirrored = converged or not len(problem.mirrored)
         solution = program.solve(
-            sigma=sigma,
-            start=solution.theta,
-            start_passive=solution.passive,
-            mirrored=sides_compared,
+            sigma=sigma, start=solution.theta, start_passive=solution.passive, mirrored=mirrored
         )
         iterations += solution.iterations
     noises = evaluation.noises

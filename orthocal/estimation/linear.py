@@ -35,8 +35,10 @@ SMALLEST_NORM = 1e-12
 prior."""
 
 SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
-"""Names of the rows of the reduced system, which are differences between the maximum and the
-minimum posture, in the order of the paper's Table 1."""
+"""Names of the rows of the reduced system: maximum minus minimum posture.
+
+The order is that of the paper's Table 1.
+"""
 
 
 def displacement_angle(displacement: float, *, length: float) -> float:
@@ -172,7 +174,8 @@ class LinearProblem:
         problem = self.problem
         rows = slice(None) if use is None else use
         jacobian, residual = self.jacobian[rows], self.residual[rows]
-        if len(jacobian) > 2 * problem.n_free:  # R of J = QR: same least squares, fewer rows
+        if len(jacobian) > 2 * problem.n_free:
+            # the factor R of a QR decomposition has the same least-squares solution
             r = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
             jacobian, residual = r[:, :-1], r[:, -1]
         reference = problem.active_theta / problem.theta_scale

@@ -34,8 +34,8 @@ MIN_CURVATURE = 1e-7
 """Norm of the curvature of all readings below which no sensor resolves it, [m per prior std²]."""
 
 MIN_CURVATURE_RATIO = 2.0
-"""Norm of the curvature over the standard deviation of a reading below which both sides have one
-optimum, or optima that differ by less than the noise."""
+"""Norm of the curvature, in standard deviations of a reading, below which both sides are not
+compared. They then have one optimum, or optima that differ by less than the noise."""
 
 NEAR = 0.5
 """Distance from the stationary point below which a solution counts as between both sides,

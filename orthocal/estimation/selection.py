@@ -314,7 +314,11 @@ def _number(text: str, where: str, name: str) -> float:
 
 
 def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> list[str]:
-    """Names of the free parameters that a glob matches; refuses none, or several units."""
+    """Names of the free parameters that a glob matches.
+
+    Raises:
+        ParameterError: If there are none, or if they have different units.
+    """
     matches = [n for n in parameters.select([glob]) if n in free]
     if not matches:
         raise ParameterError(f"'{glob}' matches no free parameter")
@@ -363,7 +367,7 @@ def _refuse_length(value: float, parameter: Parameter) -> None:
 
 
 def _require_finite(value: float, name: str) -> float:
-    """Known value of a parameter; refuses a value that is not finite."""
+    """Refuse a known value that is not finite; return it as a float."""
     if not math.isfinite(value):
         raise ParameterError(f"the known value of '{name}' is {value}; expected a finite number")
     return float(value)

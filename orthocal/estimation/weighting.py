@@ -104,8 +104,8 @@ def initial_sigmas(
 ) -> Array:
     """Standard deviation of each entry before the first solution, shape (n_entries,), [m].
 
-    The scatter of repeated cycles of a gauge with a stated noise is that of most of its setups, so
-    that it does not contain a mistake in one of them.
+    For a gauge with a stated noise, the scatter of repeated cycles is the median over its setups. A
+    mistake in one setup does not change it.
 
     Args:
         session: The session.

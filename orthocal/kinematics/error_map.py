@@ -315,7 +315,7 @@ class ErrorMap:
             unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
             commands: Shape (V, n_command).
         """
-        of_varying = (6 * self.varying[:, None] + np.arange(6)).reshape(-1)
+        of_varying = twist_components(self.varying)
         constant, by_errors, general_unit_errors = self._twists.split(
             _repeat_for(errors, commands), unit_errors, self._conditions(commands[None])
         )
@@ -541,6 +541,15 @@ def error_map(robot: Robot) -> ErrorMap:
     return ErrorMap(robot)
 
 
+def twist_components(placements: Indices) -> Indices:
+    """Indices of the components of the twists of moved placements, shape (6 n,).
+
+    Args:
+        placements: Indices of the moved placements, shape (n,).
+    """
+    return np.asarray((6 * placements[:, None] + np.arange(6)).reshape(-1))
+
+
 def _repeat_for(errors: Array, commands: Array) -> Array:
     """Errors of S machines for each of V commands, shape (S, V, n_errors)."""
     return np.broadcast_to(errors[:, None], (len(errors), len(commands), errors.shape[-1]))
@@ -667,7 +676,7 @@ def _moved_placements(
         The function, and the sparsity of ∂ξ/∂θ̂, shape (6 n, n_free).
     """
     theta, conditions = ca.MX.sym("theta", unit_errors.shape[1]), ca.MX.sym("u", map_.n_conditions)
-    rows = (6 * chosen[:, None] + np.arange(6)).reshape(-1).tolist()
+    rows = twist_components(chosen).tolist()
     symbols = map_.twists.sx_in()
     outputs = [v[rows, :] for v in map_.twists(*symbols)]
     twists = ca.Function("twists", symbols, outputs)

@@ -119,6 +119,7 @@ class LoopClosure:
         Raises:
             ClosureError: If a posture cannot be reached, is outside the limits of a passive joint,
                 or is singular without `allow_free`; states the posture and the residual.
+            ValueError: If an argument has another shape.
         """
         d, single = self._as_commands(drives)
         values = self._all_errors(theta, errors)
@@ -169,6 +170,7 @@ class LoopClosure:
         Raises:
             ClosureError: If a posture cannot be reached or is singular.
             RobotError: If the robot has no tool centre point.
+            ValueError: If an argument has another shape.
         """
         d, single = self._as_commands(drives)
         passive = self.close(d, theta=theta, start=start, names=names, failures=failures)
@@ -197,6 +199,7 @@ class LoopClosure:
         Raises:
             ClosureError: If a point cannot be reached.
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
+            ValueError: If an argument has another shape.
         """
         coordinates = require_tcp(self.robot).coordinates
         p = _as_numbers(points, len(coordinates), "coordinates")
@@ -551,7 +554,7 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None 
         size = drive.joint_size
         for i in np.flatnonzero(drive.is_beyond(values)).tolist():
             reason = (
-                f"has {drive.name}_{drive.joint_unit} {values[i] / size:g}; the drive reaches from "
+                f"{drive.name}_{drive.joint_unit} is {values[i] / size:g}; the drive reaches from "
                 f"{drive.lower / size:g} to {drive.upper / size:g}"
             )
             failures.setdefault(i, ClosureError(reason, posture=labels[i]))

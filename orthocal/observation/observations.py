@@ -185,8 +185,8 @@ def build_observations(session: Session) -> Observations:
     """Split the readings of a session into single readings with gauge zeros.
 
     Raises:
-        SessionError: If readings of pairs of postures and effects on the geometry exclude each
-            other.
+        SessionError: If there are readings of pairs of postures, and effects by which the geometry
+            differs between postures.
     """
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
@@ -197,11 +197,7 @@ def build_observations(session: Session) -> Observations:
     zeros: dict[tuple[str] | Node, int] = {}
     nodes: dict[Node, int] = {}
     plus, minus = [], []
-    # differences that share postures, directly or by others, are a group
-    leaders: dict[Node, Node] = {}
-    for r in session.readings:
-        if r.minus is not None and session.is_difference(r):
-            connect(leaders, (r.setup, r.cycle, r.posture), (r.setup, r.cycle, r.minus))
+    leaders = _group_differences(session)
 
     def add(reading: Reading, posture: str, zero: tuple[str] | Node) -> int:
         number = zeros.setdefault(zero, len(zeros))
@@ -243,6 +239,15 @@ def build_observations(session: Session) -> Observations:
         conditions=values,
         states=states,
     )
+
+
+def _group_differences(session: Session) -> dict[Node, Node]:
+    """Groups of differences that share postures, directly or by others (see `find_leader`)."""
+    leaders: dict[Node, Node] = {}
+    for r in session.readings:
+        if r.minus is not None and session.is_difference(r):
+            connect(leaders, (r.setup, r.cycle, r.posture), (r.setup, r.cycle, r.minus))
+    return leaders
 
 
 def _observe(

@@ -120,8 +120,9 @@ def simulate_session(
             range of the gauge.
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the name of an error is unknown.
+        RobotError: If closure rows of the robot are linearly dependent.
         TypeError: If an argument has a wrong type.
-        ValueError: If sigma is not a number of at least 0.
+        ValueError: If sigma is not a number of at least 0, or the seed is invalid.
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
     require_numbers(errors, argument="errors")
@@ -153,6 +154,14 @@ def simulate_session(
         seed=seed,
     )
     return SimulatedSession(session, machine_errors, zeros, truth)
+
+
+def _draw_nuisance(nuisance: Sequence[Parameter], seed: int) -> Array:
+    """Draw nuisance parameters from their priors, shape (n_nuisance,), [SI]."""
+    # a separate generator, so that the noise does not depend on nuisance parameters
+    normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
+    drawn = normal * [p.prior_std for p in nuisance]
+    return np.asarray(np.where([p.positive for p in nuisance], np.abs(drawn), drawn))
 
 
 def _mark_title(title: str) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.kinematics.error_map import ErrorMap, VaryingDerivatives
+from orthocal.kinematics.error_map import ErrorMap, VaryingDerivatives, twist_components
 from orthocal.kinematics.robot_functions import RobotFunctions
 from orthocal.observation.observations import States
 
@@ -127,7 +127,7 @@ class TwistChain:
         self._varying: VaryingDerivatives | None = None
         if len(commands) > 1 and self._used.size:
             self._varying = map_.varying_derivatives(errors, free.unit_errors, commands)
-            self._of_varying = (6 * map_.varying[:, None] + np.arange(6)).reshape(-1)
+            self._of_varying = twist_components(map_.varying)
             self._positions = pattern.position[self._of_varying]
 
     @cached_property

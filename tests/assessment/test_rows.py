@@ -114,7 +114,7 @@ def test_joints_beyond_the_travel_are_refused_one_by_one(calibration):
     rows = np.array([[0.31, 0.31, 0.31], [0.5, 0.31, 0.31]])
     chunks = list(forward_blocks(calibration, row_blocks(rows)))
     assert np.isfinite(chunks[0].values[0]).all()
-    assert chunks[0].refused[1].reason == "has x_slide_mm 500; the drive reaches from 120 to 390"
+    assert chunks[0].refused[1].reason == "x_slide_mm is 500; the drive reaches from 120 to 390"
 
 
 @pytest.fixture

@@ -229,7 +229,7 @@ def test_one_free_parameter_alone(experiment_2):
 
 def test_coordinates_beyond_the_travel_are_refused():
     machine = calibrated("table1/experiment-2").machine
-    with pytest.raises(ClosureError, match="has x_slide_mm 391; the drive reaches from 120 to 390"):
+    with pytest.raises(ClosureError, match="x_slide_mm is 391; the drive reaches from 120 to 390"):
         machine.forward([0.391, 0.31, 0.31])
     with pytest.raises(ClosureError, match="posture 'posture 1' z_slide_mm is 391"):
         machine.forward([[0.31, 0.31, 0.391], [0.391, 0.31, 0.31]])

@@ -166,7 +166,7 @@ def test_the_travel_of_a_revolute_drive_is_in_the_unit_of_its_column(fivebar):
     motor = replace(fivebar.drives[0], lower=-np.pi / 2, upper=np.pi / 2)
     robot = replace(fivebar, drives=(motor, *fivebar.drives[1:]))
     (failure,) = find_beyond_travel(robot, np.array([[np.pi, 0.0]])).values()
-    assert failure.reason == "has motor_a_deg 180; the drive reaches from -90 to 90"
+    assert failure.reason == "motor_a_deg is 180; the drive reaches from -90 to 90"
     assert f"{motor.name}_deg" in drive_columns(robot)
 
 

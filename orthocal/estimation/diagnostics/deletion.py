@@ -75,6 +75,7 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     ).covariance
     weights, s_inv_x, m_y, s_inv_diagonal = _eliminate_zeros(fit)
     gain = s_inv_x @ inverse / sigma**2
+    # Mᵢᵢ divided by the weight of the row
     redundancy = s_inv_diagonal - weights * (gain * s_inv_x).sum(axis=1)
     redundancy[redundancy < MIN_REDUNDANCY * s_inv_diagonal] = np.nan
     std = np.sqrt(np.diag(inverse))[:n]

@@ -2,9 +2,9 @@
 
 The Gauss-Newton method runs on all sets at once, from the linearised solutions, with the Jacobian
 of each set. An active-set method keeps the steps within the bounds. Sets that do not converge, or
-that end far from their prior, are solved one by one by variable projection, and so are all sets of
-a problem with mirrored directions. Every set therefore has the same optimum as if it was solved
-alone.
+that end far from their prior, are solved one by one by variable projection. All sets of a problem
+with mirrored directions are solved in this way. Every set therefore has the same optimum as if it
+was solved alone.
 """
 
 from __future__ import annotations
@@ -138,7 +138,15 @@ class BatchSolver:
 
 
 class _BatchTask:
-    """Vectorised `Task` (module `subproblem`) for many sets of readings."""
+    """Vectorised `Task` (module `subproblem`) for many sets of readings.
+
+    Attributes:
+        sigma: Standard deviation of one reading, [m].
+        low: Lower bounds of θ̂, shape (n_free,).
+        high: Upper bounds of θ̂, shape (n_free,).
+        start: θ̂ at the active offsets, shape (n_free,).
+        linear: Readings linearised about the active offsets.
+    """
 
     def __init__(self, problem: CalibrationProblem, options: SolverOptions, sigma: float) -> None:
         self.problem, self.loss, self.sigma = problem, options.loss, sigma

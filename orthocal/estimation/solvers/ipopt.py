@@ -67,7 +67,8 @@ class Expressions:
     """p: readings, weights and noise ratios of the entries, then σ, the scale of the prior and the
     width of the loss (see `parameter_values`)."""
     objective: ca.MX
-    """Σ ρ(r/σ) + ½ Σ ((θ − mean)/prior std)², times (σ/5 µm)² if σ is below 5 µm."""
+    """Σ ρ(r/σ) + ½ Σ ((θ − mean)/prior std)² over parameters with a prior, times (σ/5 µm)² if σ is
+    below 5 µm."""
     constraints: ca.MX
     """Residuals of loop closures and of manual alignments, scaled; 0 at a solution."""
     errors: dict[str, ca.MX]

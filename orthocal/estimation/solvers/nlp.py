@@ -1,8 +1,8 @@
 """Functions of the complete nonlinear program, with exact and sparse derivatives.
 
 CasADi functions of one posture and of one reading are mapped over all postures and readings. Their
-results are gathered by index into the gradient, Jacobian and Hessian of the program, so that the
-build time does not grow with the session. The functions are cached in memory and on disk.
+results are gathered by index into the gradient, Jacobian and Hessian of the program. The build time
+therefore does not grow with the session. The functions are cached in memory and on disk.
 """
 
 from __future__ import annotations
@@ -244,6 +244,7 @@ class ProgramFunctions:
         count, n_u = group.nuisance.shape
         references = problem.model.reference_commands
         prior_stds = problem.theta_scale[problem.n_machine + group.nuisance]
+        # in the order of the inputs in `_build_reading`
         separate = [
             ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
             _columns(prior_stds),
@@ -292,6 +293,7 @@ class ProgramFunctions:
         noise, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
         prior_stds = ca.SX.sym("prior_stds", n_u)
         residual = (y - expressions.reading / noise - zero * LENGTH_SCALE) / sigma
+        # derivative of the residual with respect to (θ̂, ν̂, ẑ, q̂)
         row = -ca.horzcat(
             expressions.by_theta / noise,
             expressions.by_nuisance @ ca.diag(prior_stds) / noise,

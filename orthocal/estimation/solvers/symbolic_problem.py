@@ -83,11 +83,11 @@ class SymbolicProblem:
     @cached_property
     def closure(self) -> tuple[ca.SX, ca.SX]:
         """ĝ of one posture, (closure_rows,), and ∂ĝ/∂(θ̂, q̂), (closure_rows, n)."""
-        shared, scale = self.error_map, self.problem.passive_scale
+        map_, scale = self.error_map, self.problem.passive_scale
         g, g_a, g_q, g_t = self.problem.functions.closure_expressions(
-            shared.actuated(self.command), self.passive * scale, shared.placements
+            map_.actuated(self.command), self.passive * scale, map_.placements
         )
-        by_theta = shared.chain(g_t, g_a, self.command)
+        by_theta = map_.chain(g_t, g_a, self.command)
         jacobian = ca.horzcat(by_theta, g_q @ ca.diag(ca.SX(scale)))
         return self._row_scale * g, ca.diag(self._row_scale) @ jacobian
 
@@ -103,18 +103,18 @@ class SymbolicProblem:
 
     def _express(self, group: SensorGroup) -> ReadingExpressions:
         """Expressions of one reading of a sensor group."""
-        shared, scale = self.error_map, self.problem.passive_scale
+        map_, scale = self.error_map, self.problem.passive_scale
         constants = ca.SX.sym("constants", group.constants.shape[1])
         nuisance = ca.SX.sym("nuisance", group.nuisance.shape[1])
         h, h_a, h_q, h_t, h_r, h_nu, *by_second = self._evaluate(
-            group, shared.placements, constants, nuisance
+            group, map_.placements, constants, nuisance
         )
-        by_theta = shared.chain(h_t, h_a, self.command)
-        by_theta += shared.chain(ca.SX(*h_t.shape), h_r, self.reference)
+        by_theta = map_.chain(h_t, h_a, self.command)
+        by_theta += map_.chain(ca.SX(*h_t.shape), h_r, self.reference)
         h_q2 = ca.SX(1, 0)
         if by_second:
             h_a2, h_q2 = by_second
-            by_theta += shared.chain(ca.SX(*h_t.shape), h_a2, self.second[0])
+            by_theta += map_.chain(ca.SX(*h_t.shape), h_a2, self.second[0])
         by_theta, by_q = ca.sparsify(by_theta), [ca.sparsify(h_q), ca.sparsify(h_q2)]
         theta_index, indices = _used_columns(by_theta), [_used_columns(row) for row in by_q]
         by_passive = ca.horzcat(
