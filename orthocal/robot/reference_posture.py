@@ -119,14 +119,19 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
 
 
 def _find_joints_outside_limits(robot: Robot, start: Array, free: Indices) -> list[str]:
-    """Joints outside their limits in a posture that closes the loops if limits are ignored."""
+    """Joints outside their limits in a posture that closes the loops if limits are ignored.
+
+    The list is empty if no such posture is found.
+    """
     lower, upper = coordinate_limits(robot.model)
     if not np.isfinite([lower[free], upper[free]]).any():
         return []
     closings = (
         robot.close_coordinates(s, free, limited=False) for s in _starts(robot, start, free)
     )
-    x = next((c.coordinates for c in closings if c.closed), np.clip(start, lower, upper))
+    x = next((c.coordinates for c in closings if c.closed), None)
+    if x is None:
+        return []
     outside = np.flatnonzero((x < lower - LIMIT_TOLERANCE) | (x > upper + LIMIT_TOLERANCE))
     names = coordinate_names(robot.model)
     return [names[k] for k in outside.tolist()]

@@ -87,7 +87,7 @@ class SectionKeys(OneKey):
     """Distance from the root in the mechanical zero, as a fraction of the leg length."""
 
 
-class LegKeys(MountingKeys, SetupKeys):
+class LegIndicatorKeys(MountingKeys, SetupKeys):
     """Keys of a setup with an indicator on a leg, as in a session.yaml."""
 
     leg: Name
@@ -179,7 +179,7 @@ class LegIndicator:
     """Displacement of the tip from the nominal rod in the mechanical zero, shape (3,), [m]."""
 
     kind: ClassVar[str] = "leg"
-    keys: ClassVar[type[SetupKeys]] = LegKeys
+    keys: ClassVar[type[SetupKeys]] = LegIndicatorKeys
     ideal: ClassVar[str] = "parallel"
     touch: ClassVar[Callable[..., ca.SX]] = touch_by_blade
     """Function of a rod and the tip that returns the reading, such as `touch_by_blade`."""
@@ -189,7 +189,7 @@ class LegIndicator:
             raise ValueError(f"tip: found a {self.tip.form}; `on_rod` makes an indicator with it")
 
     @classmethod
-    def from_keys(cls, keys: LegKeys) -> LegIndicator:
+    def from_keys(cls, keys: LegIndicatorKeys) -> LegIndicator:
         """Build from the keys of a session.yaml.
 
         Raises:
