@@ -185,6 +185,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     smallest = SINGULARITY_MARGIN * values[independent][-1:]  # none without passive joints
 
     def is_regular(candidate: Closing) -> bool:
+        """True if the posture keeps the margin to singular ones."""
         return bool((_singular_values(robot, candidate)[independent][-1:] >= smallest).all())
 
     free = np.concatenate([movable, robot.passive_index])
@@ -197,6 +198,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     for _ in range(MAX_RETURN_STEPS):
         _, jacobian = robot.evaluate_constraints_at(closing.coordinates)
         motions = _null_space(jacobian[:, free] * scales[free])
+        # the cut-off excludes motions that hardly move the drives
         amounts = np.linalg.lstsq(motions[: movable.size], distances(closing), rcond=1e-6)[0]
         step = motions @ amounts
         step *= factor * min(1.0, LARGEST_RETURN_STEP / max(float(np.abs(step).max()), 1e-300))
@@ -210,6 +212,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
             break
         else:
             factor *= 0.25
+    # drives near their zeros are set to them, and the loops are closed by the others
     trial = np.array(closing.coordinates)
     near = movable[np.abs(distances(closing)) < SNAP_DISTANCE]
     trial[near] = target[near]
