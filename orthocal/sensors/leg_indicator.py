@@ -124,6 +124,7 @@ class Section:
     """Section: position along the leg's nominal axis at which the gauge touches."""
 
     form: SectionForm
+    """Key that states the section."""
     value: float
     """World coordinate [m], distance from the root at the mechanical zero [m], or fraction [1]."""
 
@@ -324,9 +325,9 @@ class LegIndicator:
     def constants(self, robot: Robot) -> Array:
         """Constants of the expression, shape (15,), [m].
 
-        Direction (3), plane of the section (1), 1 if the plane refers to the root and 0 otherwise,
-        axis of the leg (3), edge of the blade (3), position of the tip across the leg (3), and sum
-        of the radii of rod and tip (1).
+        Direction (3); plane of the section (1); 1 if the plane refers to the root, else 0 (1);
+        axis of the leg (3); edge of the blade (3); position of the tip across the leg (3); sum of
+        the radii of rod and tip (1).
         """
         leg = robot.legs[self.leg]
         plane, from_root = self.plane(robot)
