@@ -208,6 +208,7 @@ class Orthoglide(SlidingLegs):
             return f"[{', '.join(in_mm(v) for v in values)}]"
 
         def unit(axis: int) -> str:
+            """Unit vector of an axis."""
             return f"[{', '.join('1' if k == axis else '0' for k in range(3))}]"
 
         lines = []

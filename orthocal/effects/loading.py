@@ -87,7 +87,7 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
     if chosen == robot.chosen_effects:
         return robot
     existing = effect_names()
-    for name in chosen or ():
+    for name in chosen or ():  # `robot_effects` would name the YAML as the source of the name
         if name not in existing:
             raise ParameterError(f"'{name}' is not an effect; effects: {', '.join(existing)}")
     return _choose_effects(robot, chosen)

@@ -108,9 +108,9 @@ class Thermal(Effect):
     def negligible_difference(self, condition: Condition, change: float) -> float:
         """Difference of temperature (see `Effect.negligible_difference`), [K].
 
-        A difference of 1 K is assumed to change a reading by the growth of the longest rod and of
-        the longest screw, both coefficients at their upper limits. The length of a screw is that
-        from its fixed bearing to the mechanical zero; readings beyond it change slightly more.
+        The largest change of a reading is assumed to be the growth of the longest rod and of the
+        longest screw, both coefficients at their upper limits. A screw is as long as from its fixed
+        bearing to the mechanical zero; readings beyond it change slightly more.
         """
         drives = zip(self.robot.drives, self.fixed, strict=True)
         rods = (rod.length for rod in self.robot.rods.values())

@@ -130,6 +130,7 @@ def _decompose(residual: Array, jacobian: Array) -> Callable[[float], Array]:
     s, vt, projected = values[nonzero], vt[nonzero], (u.T @ residual)[nonzero]
 
     def damped_step(damping: float) -> Array:
+        """Scaled step −(JᵀJ + μ)⁻¹ Jᵀ r of minimum norm."""
         return np.asarray(-(vt.T @ (s / (s * s + damping) * projected)))
 
     return damped_step

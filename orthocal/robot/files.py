@@ -47,8 +47,9 @@ def is_inner_path(name: str) -> bool:
 def collect_files(robot: Robot) -> Mapping[str, bytes]:
     """Content of all files of a robot by name: URDF, YAML, then meshes.
 
-    Meshes are needed for drawings only. They are omitted if their total size exceeds LARGEST_MESHES
-    or their number MOST_FILES.
+    Meshes are needed for drawings only. All are omitted if their total size exceeds LARGEST_MESHES,
+    the number of files exceeds MOST_FILES, or one cannot be read. Meshes outside of the directory
+    or of other formats are omitted singly.
     """
     if robot.folder is None:
         return robot.content

@@ -119,14 +119,19 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
 
 
 def _find_joints_outside_limits(robot: Robot, start: Array, free: Indices) -> list[str]:
-    """Joints outside their limits in a posture that closes the loops if limits are ignored."""
+    """Joints outside their limits in a posture that closes the loops if limits are ignored.
+
+    The list is empty if no such posture is found.
+    """
     lower, upper = coordinate_limits(robot.model)
     if not np.isfinite([lower[free], upper[free]]).any():
         return []
     closings = (
         robot.close_coordinates(s, free, limited=False) for s in _starts(robot, start, free)
     )
-    x = next((c.coordinates for c in closings if c.closed), np.clip(start, lower, upper))
+    x = next((c.coordinates for c in closings if c.closed), None)
+    if x is None:
+        return []
     outside = np.flatnonzero((x < lower - LIMIT_TOLERANCE) | (x > upper + LIMIT_TOLERANCE))
     names = coordinate_names(robot.model)
     return [names[k] for k in outside.tolist()]
@@ -180,6 +185,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     smallest = SINGULARITY_MARGIN * values[independent][-1:]  # none without passive joints
 
     def is_regular(candidate: Closing) -> bool:
+        """True if the posture keeps the margin to singular ones."""
         return bool((_singular_values(robot, candidate)[independent][-1:] >= smallest).all())
 
     free = np.concatenate([movable, robot.passive_index])
@@ -192,6 +198,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     for _ in range(MAX_RETURN_STEPS):
         _, jacobian = robot.evaluate_constraints_at(closing.coordinates)
         motions = _null_space(jacobian[:, free] * scales[free])
+        # the cut-off excludes motions that hardly move the drives
         amounts = np.linalg.lstsq(motions[: movable.size], distances(closing), rcond=1e-6)[0]
         step = motions @ amounts
         step *= factor * min(1.0, LARGEST_RETURN_STEP / max(float(np.abs(step).max()), 1e-300))
@@ -205,6 +212,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
             break
         else:
             factor *= 0.25
+    # drives near their zeros are set to them, and the loops are closed by the others
     trial = np.array(closing.coordinates)
     near = movable[np.abs(distances(closing)) < SNAP_DISTANCE]
     trial[near] = target[near]

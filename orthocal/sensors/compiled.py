@@ -184,8 +184,8 @@ def _build(pattern: ReadingPattern, name: str) -> ca.Function:
 def _express(pattern: ReadingPattern) -> tuple[list[ca.SX], list[ca.SX]]:
     """Inputs and outputs of the compiled functions, as in `CompiledReading.jacobian`.
 
-    Each frame contributes fᵀ ∂p + mᵀ ∂φ to the derivatives, with f and m the force and moment that
-    are equivalent to the derivative of the sensor's expression with respect to its pose.
+    Each frame contributes fᵀ ∂p + mᵀ ∂φ to the derivatives, where p is its position and φ its
+    rotation. Force f and moment m are the derivative of the sensor's expression (`_wrench`).
     """
     robot = pattern.robot
     here: RobotFunctions = robot_functions(robot)

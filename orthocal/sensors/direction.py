@@ -119,6 +119,6 @@ def _oblique_leg_hint(leg: Leg) -> str:
     """Hint for a leg that is not along an axis of the world frame."""
     along = ", ".join(f"{v:.3f}" for v in leg.axis)
     return (
-        f". In the mechanical zero the leg lies along ({along}): where it should lie along an axis "
-        "of the world, check lengths and zeros in the robot's files"
+        f". In the mechanical zero the leg is along ({along}). If it should be along an axis of "
+        "the world frame, check lengths and zeros in the robot's files"
     )

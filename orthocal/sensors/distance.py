@@ -1,12 +1,12 @@
 """Distance between two positions at which the tool printed or marked, measured by a calliper.
 
 A reading belongs to a pair of postures: the posture of its row and the one in the column `minus`.
-With p and q the tool positions in both, w the width of the pillar that the calliper includes, and s
-the scale error of calliper and print,
+With p and q the tool positions in both,
 
     h = (1 + s) (|p − q| + w)
 
-The distance is absolute. The scale error of the print is its shrinkage.
+w is the width of the pillar that the calliper includes. s is the scale error of calliper and print,
+which includes the shrinkage of the print. The distance is absolute.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class SectionKeys(OneKey):
     """Distance from the root in the mechanical zero, as a fraction of the leg length."""
 
 
-class LegKeys(MountingKeys, SetupKeys):
+class LegIndicatorKeys(MountingKeys, SetupKeys):
     """Keys of a setup with an indicator on a leg, as in a session.yaml."""
 
     leg: Name
@@ -124,6 +124,7 @@ class Section:
     """Section: position along the leg's nominal axis at which the gauge touches."""
 
     form: SectionForm
+    """Key that states the section."""
     value: float
     """World coordinate [m], distance from the root at the mechanical zero [m], or fraction [1]."""
 
@@ -179,7 +180,7 @@ class LegIndicator:
     """Displacement of the tip from the nominal rod in the mechanical zero, shape (3,), [m]."""
 
     kind: ClassVar[str] = "leg"
-    keys: ClassVar[type[SetupKeys]] = LegKeys
+    keys: ClassVar[type[SetupKeys]] = LegIndicatorKeys
     ideal: ClassVar[str] = "parallel"
     touch: ClassVar[Callable[..., ca.SX]] = touch_by_blade
     """Function of a rod and the tip that returns the reading, such as `touch_by_blade`."""
@@ -189,7 +190,7 @@ class LegIndicator:
             raise ValueError(f"tip: found a {self.tip.form}; `on_rod` makes an indicator with it")
 
     @classmethod
-    def from_keys(cls, keys: LegKeys) -> LegIndicator:
+    def from_keys(cls, keys: LegIndicatorKeys) -> LegIndicator:
         """Build from the keys of a session.yaml.
 
         Raises:
@@ -324,9 +325,9 @@ class LegIndicator:
     def constants(self, robot: Robot) -> Array:
         """Constants of the expression, shape (15,), [m].
 
-        Direction (3), plane of the section (1), 1 if the plane refers to the root and 0 otherwise,
-        axis of the leg (3), edge of the blade (3), position of the tip across the leg (3), and sum
-        of the radii of rod and tip (1).
+        Direction (3); plane of the section (1); 1 if the plane refers to the root, else 0 (1);
+        axis of the leg (3); edge of the blade (3); position of the tip across the leg (3); sum of
+        the radii of rod and tip (1).
         """
         leg = robot.legs[self.leg]
         plane, from_root = self.plane(robot)

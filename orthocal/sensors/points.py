@@ -1,13 +1,13 @@
 """Points: coordinates of a target at the tool, from a tracker, an arm, a camera or a microscope.
 
-The instrument shows the position of the target in the frame of the station. With q the target in
-the world frame, t and R the pose of the station, and s the error of its scale, the reading along a
+The instrument shows the position of the target in the frame of the station. The reading along a
 unit vector a of the station is
 
     h = (1 + s) aᵀ Rᵀ (Eᵀ (q − e) − t)
 
-E and e are the rotation and displacement errors of the station about the world origin, which is
-near the machine.
+q is the target in the world frame, t and R are position and rotation of the station, and s is the
+error of its scale. E and e are the rotation and displacement errors of the station about the world
+origin, which is near the machine.
 
 A reading is one number, so a setup of points is read as three sensors with orthogonal a. These are
 the axes of the station, or the principal axes of the covariance of a point, along which its errors
@@ -96,6 +96,7 @@ class PointKeys(SetupKeys):
     target_mm: Vector3 = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Position of the target, from the tool centre point, in the tool's frame."""
     frame: Literal["unknown"] | FrameKeys = "unknown"
+    """Frame of the station: unknown, or nominally the world frame with tolerances."""
     station: Name | None = None
     """Name of the station, if several setups share its pose."""
     scale_tolerance: ScaleTolerance = 0.0
@@ -103,6 +104,7 @@ class PointKeys(SetupKeys):
     """Covariance of the coordinates of a point in the frame of the station; by default independent
     coordinates with the gauge's sigma_mm."""
     axis: AxisKeys | None = None
+    """Axis of a recorded sensor; a session.yaml has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,7 +358,7 @@ def _consistent_points(points: Array, targets: Array) -> Indices:
 def _rms_residuals(points: Array, targets: Array) -> Array:
     """RMS residuals of the best fits to all points, and to all without each of them.
 
-    With the centred points p and targets q, H = Σ p qᵀ and its singular values σ, the squared
+    p and q are the centred points and targets, and σ the singular values of H = Σ p qᵀ. The squared
     residuals of the best fit sum to Σ |p|² + Σ |q|² − 2 (σ1 + σ2 + sign(det H) σ3). Without one of
     n points, whose centroid differs, each sum loses n / (n − 1) times the term of this point.
 

@@ -2,8 +2,8 @@
 
 The artefact is clamped to the table. Its surface is a plane with normal n, nominally the direction
 d of the plunger in the reference posture. The tip q and the plunger's direction u move with the
-tool. The point q₀ of the nominal surface is the tip in the reference posture of the nominal
-machine, or for a probe the origin of the world frame:
+tool. q₀ is a point of the nominal surface: the tip in the reference posture of the nominal machine,
+or for a probe the origin of the world frame. The reading is
 
     h = (1 + s) ((n · (q - q₀) + H) / (n · u) + f(q))
 

@@ -196,6 +196,7 @@ def find_base_parameters(
     if not np.any(factor):
         return ()
     singular_values = np.linalg.svd(factor, compute_uv=False)
+    # no diagonal element of R₁ is smaller than the smallest singular value
     if len(singular_values) == factor.shape[1] and singular_values[-1] > threshold * (1.0 + 1e-9):
         return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # all are resolvable
     from scipy import linalg
@@ -236,6 +237,7 @@ def _find_alike(
     while pending:
         lead, *others = pending
         slope = products[lead, others] / norms[lead] ** 2
+        # squared distances of the columns from multiples of the leading one
         square = norms[others] ** 2 - slope**2 * norms[lead] ** 2
         # half of the digits cancel in a difference of squares
         floor = (1e-7 * norms[others]) ** 2

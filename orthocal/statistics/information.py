@@ -223,8 +223,9 @@ def assume_others_known(information: Information, n_first: int) -> Information:
 def count_others(information: Information, n_first: int, *, sigma: float) -> float:
     """Effective number of the other parameters, with their priors and none of the first ones.
 
-    With F = (F₁ F₂) and the hat matrix H = F (FᵀF + σ² P⁻¹)⁻¹ Fᵀ, P⁻¹ = diag(0, I), it is
-    tr H − rank F₁ = Σ s²/(s² + σ²), s the singular values of F₂ orthogonal to the columns of F₁.
+    With F = (F₁ F₂) and P⁻¹ = diag(0, I) the hat matrix is H = F (FᵀF + σ² P⁻¹)⁻¹ Fᵀ. The number is
+    tr H − rank F₁ = Σ s²/(s² + σ²). The s are the singular values of the part of F₂ that is
+    orthogonal to the columns of F₁.
 
     Args:
         information: Information about all parameters.
