@@ -156,14 +156,6 @@ def simulate_session(
     return SimulatedSession(session, machine_errors, zeros, truth)
 
 
-def _draw_nuisance(nuisance: Sequence[Parameter], seed: int) -> Array:
-    """Draw nuisance parameters from their priors, shape (n_nuisance,), [SI]."""
-    # a separate generator, so that the noise does not depend on nuisance parameters
-    normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
-    drawn = normal * [p.prior_std for p in nuisance]
-    return np.asarray(np.where([p.positive for p in nuisance], np.abs(drawn), drawn))
-
-
 def _mark_title(title: str) -> str:
     """Title that begins with the word "Simulated"."""
     if title.startswith("Simulated"):
