@@ -148,6 +148,7 @@ class LinearProblem:
     """Problem linearised about the active offsets of the controller."""
 
     problem: CalibrationProblem
+    """The problem."""
     residual: Array
     """Measured minus predicted readings y − h, gauge zeros eliminated, shape (n_entries,),
     [noise-scaled m] (see `CalibrationProblem`)."""
