@@ -62,6 +62,7 @@ class Fit:
     """Solved problem."""
 
     problem: CalibrationProblem
+    """The problem, with the noise ratios of the solution."""
     program: Program
     """Program that solved it."""
     iterations: int

@@ -151,6 +151,7 @@ class LinearProblem:
     """
 
     problem: CalibrationProblem
+    """The problem."""
     residual: Array
     """Measured minus predicted readings y − h, gauge zeros eliminated, shape (n_entries,),
     [noise-scaled m] (see `CalibrationProblem`)."""

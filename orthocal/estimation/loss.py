@@ -49,6 +49,9 @@ class Loss:
     Args:
         kind: `squares` or `huber`, the pseudo-Huber loss.
         width: k, [standard deviations]; not used for squares.
+
+    Raises:
+        OrthocalError: If the kind is unknown, or the width is not a number above 0.
     """
 
     kind: LossKind = "squares"

@@ -112,7 +112,7 @@ def mirrored_starts(predict: Predict, theta: Array, directions: Array) -> Array:
     Args:
         predict: Readings of the S machines.
         theta: Solutions θ̂, shape (S, n_free).
-        directions: Mirrored directions, shape (n_directions, n_free).
+        directions: Mirrored directions, at least one, shape (n_directions, n_free).
     """
     distance = _stationary(*_slopes_and_curvatures(predict, directions))
     side = np.where(distance >= 0.0, 1.0, -1.0)
@@ -120,11 +120,9 @@ def mirrored_starts(predict: Predict, theta: Array, directions: Array) -> Array:
     this_side = np.where(near, distance - side, 0.0)
     other_side = distance + side * np.maximum(np.abs(distance), 1.0)
     n = len(directions)
-    changed = np.array(list(itertools.product((False, True), repeat=n)), dtype=np.bool_)
-    n_changed = changed.sum(axis=1)
-    changed = changed[(n_changed > 0) | near.any()]
-    if n > MAX_COMBINED:
-        changed = changed[changed.sum(axis=1) <= 2]
+    fewest, most = 0 if near.any() else 1, n if n <= MAX_COMBINED else 2
+    sets = (s for k in range(fewest, most + 1) for s in itertools.combinations(range(n), k))
+    changed = np.array(sorted([i in s for i in range(n)] for s in sets), dtype=np.bool_)
     steps = np.where(changed[:, None], other_side, this_side)
     return np.asarray(theta + steps @ directions)
 

@@ -387,7 +387,7 @@ class CalibrationProblem:
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
-            LinAlgError: If a posture is singular.
+            LinAlgError: If passive coordinates are passed and a posture is singular.
             ParameterError: If the units are unknown, or theta has another size.
         """
         size = np.atleast_1d(theta).shape[-1]

@@ -104,6 +104,7 @@ class UseSamples:
     """
 
     conditions: tuple[UseConditions, ...]
+    """Conditions of each sample."""
     varying: tuple[UseCondition, ...] = ()
     """Names of the fields that vary; `approach` once for each drive with two sides."""
     signs: Array = field(default_factory=lambda: np.zeros((1, 0)))

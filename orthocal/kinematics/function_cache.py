@@ -108,7 +108,9 @@ class _RobotKey:
     """Robot as key of a cache; robots with the same identity are equal."""
 
     identity: tuple[str, str]
+    """Result of `identify`."""
     robot: Robot = field(compare=False)
+    """The robot, for a call that is not cached."""
 
 
 def cached_per_robot(function: Callable[[Robot], Result]) -> Callable[[Robot], Result]:

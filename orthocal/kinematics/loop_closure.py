@@ -542,7 +542,7 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str] | None = None) -> Failures:
-    """Indices of the postures beyond the travel of a drive, in ascending order, with the reason.
+    """Indices of the postures beyond the travel of a drive, ascending, mapped to the reason.
 
     Args:
         robot: The robot.

@@ -306,7 +306,7 @@ def position_at_zero(robot: Robot) -> Array:
 
 
 def find_below_bed(robot: Robot, points: Array, names: Sequence[str] | None = None) -> Failures:
-    """Indices of tool positions below the bed of the machine, with the reason; none without a bed.
+    """Indices of tool positions below the bed, mapped to the reason; empty without a bed.
 
     Args:
         robot: The robot.

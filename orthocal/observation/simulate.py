@@ -40,7 +40,7 @@ reading is uniformly distributed."""
 
 SPARE_NOISE = 5.0
 """Distance that all readings keep from the ends of the range if possible, in standard deviations of
-their noise. If necessary, the operator sets the dial closer to the middle of the range."""
+their noise. If necessary, the operator sets the dial to another value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

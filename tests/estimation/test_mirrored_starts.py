@@ -14,6 +14,7 @@ from planned import entered
 from tolerances import SAME_NUMBER
 
 from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.mirrored_starts import mirrored_starts
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
@@ -125,6 +126,19 @@ def test_a_ball_in_general_position_has_one_start(height, planes):
     problem = problem_of(circles(entered("orthoglide"), {"a": bar_at(height)}, planes=planes))
     assert len(problem.mirrored) == 0
     assert len(solve(problem)) == 1
+
+
+def test_of_many_directions_at_most_two_change_sides_at_once():
+    """With 40 directions all 2^40 combinations would not fit into memory."""
+    count, height = 40, 2.0
+    starts = mirrored_starts(
+        lambda changes: (np.full(count, height) + changes)[None] ** 2,
+        np.full((1, count), height),
+        np.eye(count),
+    )
+    changed = (starts[:, 0] != height).sum(axis=1)
+    assert np.bincount(changed).tolist() == [0, count, count * (count - 1) // 2]
+    assert np.unique(starts).tolist() == pytest.approx([-height, height])
 
 
 def test_the_largest_number_of_iterations_applies_to_mirror_images():

@@ -97,10 +97,10 @@ class ProgramFunctions:
         lam_f = ca.MX.sym("lam_f")
         lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows + self._aligned.size)
         theta = x[: self._n_theta]
-        prior = p[3 * entries + 1] * ca.DM(problem.prior_precision)
+        prior = p[3 * entries + 1] * ca.DM(problem.prior_precision)  # scaled like the objective
         from_mean = theta - ca.DM(problem.prior_mean / problem.theta_scale)
 
-        shared = self._shared_calls(theta[: problem.n_machine])
+        shared = self._shared_values(theta[: problem.n_machine])
         objective = 0.5 * ca.dot(prior * from_mean, from_mean)
         gradient, hessian = SparseSum(n, 1), SparseSum(n, n)
         diagonal = np.arange(self._n_theta)
@@ -130,7 +130,7 @@ class ProgramFunctions:
         first = self._n_theta + self._n_zeros
         return np.asarray(first + states[:, None] * self._n_passive + index[None, :])
 
-    def _shared_calls(self, theta: ca.MX) -> list[ca.MX]:
+    def _shared_values(self, theta: ca.MX) -> list[ca.MX]:
         """Values that depend on θ̂ alone, evaluated once for all states and readings.
 
         The first one is θ̂. Values of placements that vary have one column per variant.
@@ -162,7 +162,7 @@ class ProgramFunctions:
     ) -> ca.MX:
         """Add the readings of one sensor group to gradient and Hessian; return their objective.
 
-        Local variables are (θ̂, ν̂, ẑ, q̂).
+        Local variables are θ̂, nuisance parameters ν̂, gauge zeros ẑ and passive coordinates q̂.
         """
         count, n_t = expressions.group.entries.size, expressions.theta_index.size
         theta = np.tile(expressions.theta_index, (count, 1))
@@ -210,7 +210,7 @@ class ProgramFunctions:
         Returns:
             Shape (n_entries,), [noise-scaled m].
         """
-        shared = self._shared_calls(x[: self.problem.n_machine])
+        shared = self._shared_values(x[: self.problem.n_machine])
         values, entries = [], []
         for expressions in self._symbolic.readings:
             local = self._local_variables(expressions)
@@ -238,7 +238,7 @@ class ProgramFunctions:
             local: Positions in x of (ν̂, ẑ, q̂) of its entries, shape (n, n_local).
             x: Variables of the program.
             p: Parameters of the program.
-            shared: Result of `_shared_calls`.
+            shared: Result of `_shared_values`.
         """
         problem, o, group = self.problem, self.problem.observations, expressions.group
         count, n_u = group.nuisance.shape
@@ -246,10 +246,11 @@ class ProgramFunctions:
         prior_stds = problem.theta_scale[problem.n_machine + group.nuisance]
         # in the order of the inputs in `_build_reading`
         separate = [
-            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
+            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),  # ν̂
             _columns(prior_stds),
-            x[local[:, n_u].tolist()].T,
-            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
+            x[local[:, n_u].tolist()].T,  # ẑ
+            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),  # q̂
+            # readings, weights and noise ratios
             *(p[(i * o.size + group.entries).tolist()].T for i in range(3)),
             _columns(problem.states.commands[o.state[group.entries]]),
             _columns(references[group.setups]),
@@ -258,7 +259,7 @@ class ProgramFunctions:
         if group.reading.pairs:
             separate.append(_columns(problem.states.commands[o.second[group.entries]]))
         machine, machine_mask = self._shared_arguments(shared, o.state[group.entries])
-        common = [p[3 * o.size], p[3 * o.size + 2]]
+        common = [p[3 * o.size], p[3 * o.size + 2]]  # σ and the width of the loss
         masks = [False] * len(separate) + [True] * len(common) + machine_mask
         return [*separate, *common, *machine], masks
 
@@ -290,15 +291,15 @@ class ProgramFunctions:
         zero, y, weight = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("weight")
         sigma, width, loss = ca.SX.sym("sigma"), ca.SX.sym("width"), self.loss
         n_t, n_u = expressions.theta_index.size, expressions.nuisance.numel()
-        noise, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
+        ratio, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
         prior_stds = ca.SX.sym("prior_stds", n_u)
-        residual = (y - expressions.reading / noise - zero * LENGTH_SCALE) / sigma
+        residual = (y - expressions.reading / ratio - zero * LENGTH_SCALE) / sigma
         # derivative of the residual with respect to (θ̂, ν̂, ẑ, q̂)
         row = -ca.horzcat(
-            expressions.by_theta / noise,
-            expressions.by_nuisance @ ca.diag(prior_stds) / noise,
+            expressions.by_theta / ratio,
+            expressions.by_nuisance @ ca.diag(prior_stds) / ratio,
             LENGTH_SCALE,
-            expressions.by_passive / noise,
+            expressions.by_passive / ratio,
         )
         row = ca.densify(row / sigma)
         influence = weight * loss.influence(residual, width)
@@ -307,25 +308,26 @@ class ProgramFunctions:
         # Gauss-Newton uses the secant ρ'/r, which is never below ρ'': for large residuals, where ρ
         # is nearly linear, a step with ρ'' is much too long
         curvature = loss.curvature(residual, width) if exact else loss.weight(residual, width)
-        second = weight * curvature * (row.T @ row)
+        hessian = weight * curvature * (row.T @ row)
         if exact:
-            second += (
+            hessian += (
                 influence
                 * self._reading_curvature(expressions, zero, prior_stds)
-                / (-sigma * noise)
+                / (-sigma * ratio)
             )
         symbolic = self._symbolic
-        inputs = [scaled, prior_stds, zero, symbolic.passive_of(expressions), y, weight, noise]
+        inputs = [scaled, prior_stds, zero, symbolic.passive_of(expressions), y, weight, ratio]
         inputs += [symbolic.command, symbolic.reference, expressions.constants]
         inputs += [symbolic.second[0]] if expressions.group.reading.pairs else []
         inputs += [sigma, width, *symbolic.error_map.symbols]
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
-            return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
+            elements = zip(rows.tolist(), columns.tolist(), strict=True)
+            return ca.vertcat(*(hessian[i, j] for i, j in elements))
 
         triangle = np.triu_indices(n_t), _rest_of_triangle(row.numel(), n_t)
         outputs = {
-            "reading": [expressions.reading / noise],
+            "reading": [expressions.reading / ratio],
             "objective": [weight * loss.value(residual, width)],
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
@@ -352,10 +354,10 @@ class ProgramFunctions:
         theta = symbolic.theta[expressions.theta_index.tolist()]
         passive = symbolic.passive_of(expressions)
         u = ca.vertcat(theta, expressions.nuisance, zero, passive)
-        second, _ = ca.hessian(symbolic.direct_reading(expressions), u)
+        hessian, _ = ca.hessian(symbolic.direct_reading(expressions), u)
         ones = ca.SX.ones(theta.numel()), ca.SX.ones(1 + passive.numel())
         scale = ca.diag(ca.vertcat(ones[0], prior_stds, ones[1]))
-        return ca.densify(scale @ second @ scale)
+        return ca.densify(scale @ hessian @ scale)
 
     def _add_closures(
         self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
@@ -426,14 +428,14 @@ class ProgramFunctions:
         symbolic = self._symbolic
         multiplier = ca.SX.sym("multiplier", self.problem.robot.closure_rows)
         u = ca.vertcat(symbolic.theta, symbolic.passive)
-        second = ca.triu(ca.hessian(ca.dot(multiplier, symbolic.direct_closure), u)[0])
-        rows, columns = (np.array(v) for v in second.sparsity().get_triplet())
+        curvature = ca.triu(ca.hessian(ca.dot(multiplier, symbolic.direct_closure), u)[0])
+        rows, columns = (np.array(v) for v in curvature.sparsity().get_triplet())
         summed_part = columns < self.problem.n_machine
         function = ca.Function(
             "closure_hessian",
             [symbolic.passive, symbolic.command, symbolic.theta, multiplier],
             [
-                ca.densify(second.nz[np.flatnonzero(part).tolist()])
+                ca.densify(curvature.nz[np.flatnonzero(part).tolist()])
                 for part in (summed_part, ~summed_part)
             ],
             OPTIONS,

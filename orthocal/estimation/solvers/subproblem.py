@@ -131,7 +131,6 @@ class Task:
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
-            LinAlgError: If a posture is singular.
             SolverError: If a sensor has no reading.
         """
         problem, passive = self.problem, self.data.start_passive

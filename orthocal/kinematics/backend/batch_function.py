@@ -36,6 +36,7 @@ class Layout:
     """Outputs and size of a function, which suffice to run its instructions from disk."""
 
     n_instructions: int
+    """Number of instructions of the function."""
     widths: Sequence[int]
     """Length of each input, which is a column vector."""
     names: Sequence[str]
