@@ -187,8 +187,8 @@ class ControllerEntry(FileRecord, InUnit):
     best: Number
     """Offset with the smallest tool error, [unit]; its change if the active offset is unknown."""
     enter: Number
-    """Offset to enter, [unit]: `best`, or `active` if the offsets are kept. If the active offset is
-    unknown, the change to add to it."""
+    """Offset to enter, [unit]. It is `best`, or `active` if the offsets are kept, or the change if
+    the active offset is unknown."""
     std: SizeOrNaN
     """Standard deviation of `best` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
