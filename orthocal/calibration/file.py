@@ -186,6 +186,10 @@ def _check_derived(
 ) -> None:
     """Refuse stated numbers that differ from the recomputed ones; missing numbers are accepted."""
     if isinstance(expected, dict):
+        if not isinstance(stated, dict):
+            raise CalibrationFileError(
+                f"found {shorten(str(stated))}; expected keys and values", where=f"{file}: {key}"
+            )
         for name in [name for name in expected if name in stated]:
             inner_key = f"{key}.{name}" if key else name
             _check_derived(stated[name], expected[name], file, inner_key)

@@ -138,6 +138,16 @@ def test_a_number_that_does_not_follow_from_the_others_is_refused(document, tmp_
         load_calibration(path)
 
 
+def test_a_number_in_place_of_derived_numbers_is_named(document, tmp_path):
+    def replace_by_number(part, key):
+        part[key] = 5
+
+    place = ("identifiability", "observability")
+    path = edit(document, place, replace_by_number, tmp_path / "calibration.json")
+    with pytest.raises(CalibrationFileError, match=r"observability: found 5; expected keys and"):
+        load_calibration(path)
+
+
 @pytest.mark.parametrize("place", [p for p in EDITED if "residual" in p[-1:] or len(p) == 1])
 def test_a_number_that_follows_from_the_others_may_be_omitted(document, tmp_path, place):
     path = edit(document, place, remove, tmp_path / "calibration.json")
